@@ -1,0 +1,63 @@
+"""gsopt: 3D Gaussian Splatting from few images, guided by a diffusion model and by what an expert knows.
+
+Importing this package costs nothing: each public name is loaded from its module when first used (PEP 562).
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Cameras": "gsopt.cameras",
+    "Gaussians": "gsopt.gaussians",
+    "GsoptError": "gsopt.errors",
+    "RasterSettings": "gsopt.raster.backend",
+    "Scene": "gsopt.data.scene",
+    "TrainConfig": "gsopt.config",
+    "evaluate": "gsopt.evaluate",
+    "load_scene": "gsopt.data.scene",
+    "load_splats": "gsopt.formats",
+    "rasterize": "gsopt.raster.api",
+    "save_splats": "gsopt.formats",
+    "train": "gsopt.training.loop",
+}
+
+__all__ = [
+    "Cameras",
+    "Gaussians",
+    "GsoptError",
+    "RasterSettings",
+    "Scene",
+    "TrainConfig",
+    "evaluate",
+    "load_scene",
+    "load_splats",
+    "rasterize",
+    "save_splats",
+    "train",
+]
+
+if TYPE_CHECKING:
+    from gsopt.cameras import Cameras
+    from gsopt.config import TrainConfig
+    from gsopt.data.scene import Scene, load_scene
+    from gsopt.errors import GsoptError
+    from gsopt.evaluate import evaluate
+    from gsopt.formats import load_splats, save_splats
+    from gsopt.gaussians import Gaussians
+    from gsopt.raster.api import rasterize
+    from gsopt.raster.backend import RasterSettings
+    from gsopt.training.loop import train
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'gsopt' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

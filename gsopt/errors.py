@@ -1,0 +1,36 @@
+"""What can go wrong, and the exit code the command line answers with.
+
+Every message says three things: what was wrong, what was got, and what to do about it.
+"""
+
+from __future__ import annotations
+
+
+class GsoptError(Exception):
+    """Base of every error a caller can cause. `exit_code` is what `gsopt` exits with."""
+
+    exit_code = 1
+
+
+class UsageError(GsoptError):
+    """A flag or an argument is wrong (exit code 2)."""
+
+    exit_code = 2
+
+
+class InputError(GsoptError):
+    """A file, a folder or a tensor given to us is missing, broken or hostile (exit code 3)."""
+
+    exit_code = 3
+
+
+class NumericalError(GsoptError):
+    """A value stopped being finite; the last good state was saved (exit code 4)."""
+
+    exit_code = 4
+
+
+class MissingDependency(GsoptError):
+    """An optional package is not installed; the message carries the pip line that mends it (exit code 2)."""
+
+    exit_code = 2

@@ -1,0 +1,82 @@
+"""The run directory: the only thing a run shares with Blender, the viewer or a CI job.
+
+`config.json` first and complete; `events.jsonl` append-only, one writer, one `os.write` per line
+(`{"v": 1, "seq": n, "kind": ...}`), its last line one of done, stopped, error; an empty file `stop` asks the run
+to finish its step, save and exit. A reader tails by byte offset up to the last newline.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gsopt.errors import InputError
+
+VERSION = 1
+LAST = ("done", "stopped", "error")
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a whole file or nothing: to a temporary name, flushed to disk, then renamed over `path`."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"Cannot write {path}: {error.strerror or error}. Free some space or choose another folder.") from error
+
+
+def to_json(value: Any) -> bytes:
+    """Readable, strict JSON (NaN is refused) with a final newline."""
+    return (json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode()
+
+
+class EventWriter:
+    """Appends events to `events.jsonl`; continues the numbering of an earlier run in the same folder."""
+
+    def __init__(self, run: Path) -> None:
+        self.path = run / "events.jsonl"
+        previous, _ = read_events(self.path)
+        self._seq = previous[-1]["seq"] + 1 if previous else 0
+        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        if self.path.stat().st_size and not self.path.read_bytes().endswith(b"\n"):
+            os.write(self._fd, b"\n")  # a killed writer left half a line: close it off, readers skip it
+
+    def emit(self, kind: str, **fields: Any) -> None:
+        """One line, one write."""
+        event = {"v": VERSION, "seq": self._seq, "kind": kind, "time": round(time.time(), 3), **fields}
+        os.write(self._fd, (json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n").encode())
+        self._seq += 1
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
+    """Events after byte `offset` and the offset to go on from; broken lines are skipped, a higher version is refused."""
+    if not path.exists():
+        return [], offset
+    with open(path, "rb") as file:
+        file.seek(offset)
+        data = file.read()
+    end = data.rfind(b"\n") + 1
+    events: list[dict[str, Any]] = []
+    for line in data[:end].splitlines():
+        try:
+            event = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if not isinstance(event, Mapping) or not isinstance(event.get("seq"), int):
+            continue
+        if event.get("v") != VERSION:
+            raise InputError(f"{path} speaks protocol version {event.get('v')}, this gsopt reads {VERSION}. Update gsopt.")
+        events.append(dict(event))
+    return events, offset + end

@@ -1,0 +1,151 @@
+"""What a rasteriser backend must offer, and how one is chosen.
+
+A backend draws one camera at a time. `forward` returns a `Frame`, `backward` turns the gradient of a loss with
+respect to that frame into gradients of the parameters. The training loop calls these two directly; `rasterize`
+in `api.py` wraps the same two in autograd.
+
+The image model, which the float64 reference defines and every backend follows:
+
+* camera space t = viewmat · mean; a Gaussian is drawn when near_plane < t_z < far_plane.
+* cov2d = J W Σ Wᵀ Jᵀ + eps2d·I with J the Jacobian of the pinhole projection at t, its t_x/t_z and t_y/t_z clamped to
+  the view widened by 30 % of tan(fov/2) on either side (Zwicker 2001; Kerbl et al. 2023).
+* opacity o = sigmoid(logit), times sqrt(max(0, det cov / det cov2d)) when antialiased (Yu et al. 2024).
+* alpha(p) = min(0.99, o · exp(-½ (p-mean2d)ᵀ cov2d⁻¹ (p-mean2d))), p the pixel centre; below 1/255 it contributes nothing.
+  Where alpha is clamped to 0.99 the gradient with respect to o and the exponent is zero, as the derivative says.
+* front to back by depth t_z, ties by index; a pixel takes no more once its transmittance T <= 1e-4.
+* colour = Σ T alpha c + T_final · background; alpha = 1 - T_final; depth = Σ T alpha t_z (not normalised).
+* c = max(0, 0.5 + Σ sh_k Y_k(d)), d the unit vector from the camera centre to the mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gsopt import check
+from gsopt.cameras import Cameras
+from gsopt.gaussians import Gaussians
+
+ALPHA_MIN = 1.0 / 255.0
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How Gaussians become pixels."""
+
+    sh_degree: int = 3
+    """Highest band of the spherical harmonics that is evaluated (0-3)."""
+    near_plane: float = 0.01
+    """Gaussians nearer than this along the viewing axis are not drawn, scene units."""
+    far_plane: float = 1e10
+    """Gaussians farther than this are not drawn, scene units."""
+    eps2d: float = 0.3
+    """Variance added to every splat, px²."""
+    antialiased: bool = False
+    """Lower the opacity by what eps2d adds to a splat's area (Mip-Splatting's 2D filter)."""
+
+    def __post_init__(self) -> None:
+        check.within("sh_degree", self.sh_degree, 0, 3, "Bands 0 to 3 are supported.")
+        check.at_least("near_plane", self.near_plane, 0.0, "Give a distance in scene units.")
+        check.at_least("far_plane", self.far_plane, self.near_plane, "It must lie beyond near_plane.")
+        check.at_least("eps2d", self.eps2d, 0.0, "Give a variance in px².")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What one camera saw. Keeps, out of sight, what `backward` needs."""
+
+    colors: Float[Tensor, "H W 3"]
+    """Composited on the background that was given, else premultiplied."""
+    alphas: Float[Tensor, "H W"]
+    depths: Float[Tensor, "H W"] | None
+    """Σ T alpha z, not normalised; None unless asked for."""
+    radii: Int[Tensor, "N 2"]
+    """Half-extent of each splat's alpha >= 1/255 box in pixels, rounded up; 0 where it is not in the image."""
+    context: object
+    """Private to the backend."""
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """dLoss/dparameter for every Gaussian, and what density control reads."""
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    log_scales: Float[Tensor, "N 3"]
+    logit_opacities: Float[Tensor, "N"]
+    sh0: Float[Tensor, "N 1 3"]
+    shN: Float[Tensor, "N K-1 3"]
+    """Rows of bands above the rendered sh_degree are zero."""
+    means2d: Float[Tensor, "N 2"]
+    """dLoss/d(mean2d), 1/px: signed sum over pixels."""
+    means2d_abs: Float[Tensor, "N 2"] | None
+    """The same with absolute values summed over pixels (AbsGS, Ye et al. 2024); None unless asked for."""
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """(1 - lambda_dssim) · L1 + lambda_dssim · (1 - SSIM), averaged over pixels and channels."""
+
+    l1: float
+    ssim: float
+    loss: float
+    v_colors: Float[Tensor, "H W 3"]
+    """dLoss/d(rendered)."""
+
+
+class Backend(Protocol):
+    """A rasteriser, its photometric loss and its optimiser step: what runs once per training step."""
+
+    name: str
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        camera: Cameras,
+        settings: RasterSettings,
+        background: Float[Tensor, "3"] | None = None,
+        *,
+        depth: bool = False,
+    ) -> Frame:
+        """Draw one camera (len(camera) == 1)."""
+        ...
+
+    def backward(
+        self,
+        frame: Frame,
+        v_colors: Float[Tensor, "H W 3"],
+        v_alphas: Float[Tensor, "H W"] | None = None,
+        v_depths: Float[Tensor, "H W"] | None = None,
+        *,
+        absgrad: bool = False,
+    ) -> Gradients:
+        """Gradients of the parameters that `forward` drew. A frame can be used once."""
+        ...
+
+    def photometric(
+        self, rendered: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], lambda_dssim: float
+    ) -> Photometric:
+        """Fused L1 + D-SSIM and its gradient; SSIM 11x11, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03²."""
+        ...
+
+    def adam(
+        self,
+        param: Tensor,
+        grad: Tensor,
+        exp_avg: Tensor,
+        exp_avg_sq: Tensor,
+        *,
+        lr: float,
+        beta1: float,
+        beta2: float,
+        eps: float,
+        step: int,
+    ) -> None:
+        """One Adam step in place (Kingma & Ba 2015), `step` counted from 1. All tensors [N, ...], same shape."""
+        ...
