@@ -1,0 +1,64 @@
+"""How splats leave and return: one reader and one writer, the format chosen by the file's suffix.
+
+| suffix | format | loss |
+|---|---|---|
+| `.ply` | Inria PLY | none |
+| `.compressed.ply` | PlayCanvas compressed PLY | quantised in chunks of 256 |
+| `.splat` | antimatter15 | no view-dependent color, 8-bit color and rotation |
+| `.spz` | Niantic SPZ | 24-bit position, 8-bit rest |
+| `.glb` | glTF, KHR_gaussian_splatting | rounding of exp and sigmoid |
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsopt.errors import InputError
+
+if TYPE_CHECKING:
+    from gsopt.gaussians import Gaussians
+
+SUFFIXES = (".ply", ".compressed.ply", ".splat", ".spz", ".glb")
+
+
+def suffix_of(path: Path) -> str:
+    """The one of SUFFIXES that names the format of `path`, or InputError listing them."""
+    name = path.name.lower()
+    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+        if name.endswith(suffix):
+            return suffix
+    raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {path.suffix!r}. Rename it or choose one.")
+
+
+def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased: bool = False) -> None:
+    """Write `gaussians` in the format that the suffix of `path` names; whole file or nothing.
+
+    `antialiased`: the splats were optimised with the 2D filter of Mip-Splatting; noted where the format can (.ply,
+    .spz). Raises InputError for a row that is not finite, a rotation of length zero, a full disk or an unknown suffix.
+    """
+    path = Path(path)
+    match suffix_of(path):
+        case ".ply":
+            from gsopt.formats.ply import save_ply
+
+            save_ply(path, gaussians, antialiased=antialiased)
+        case other:
+            raise InputError(f"{path}: {other} cannot be written yet. Use .ply.")
+
+
+def load_splats(path: str | PathLike[str]) -> Gaussians:
+    """Read splats in the format that the suffix of `path` names; float32 on the CPU, every value finite.
+
+    The file is not trusted: what it claims is checked against its size before memory is taken. Raises InputError
+    for whatever is wrong with it.
+    """
+    path = Path(path)
+    match suffix_of(path):
+        case ".ply":
+            from gsopt.formats.ply import load_ply
+
+            return load_ply(path)
+        case other:
+            raise InputError(f"{path}: {other} cannot be read yet. Use .ply.")

@@ -1,0 +1,69 @@
+"""The one check every splat passes on its way in or out, and how a faulty element is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsopt.errors import InputError
+from gsopt.gaussians import Gaussians
+
+MAX_SH_DEGREE = 3
+_XYZ = "xyz"
+_TINY = torch.finfo(torch.float32).tiny
+
+
+def storable(gaussians: Gaussians, path: Path) -> Gaussians:
+    """The record as float32 on the CPU, detached, checked by `checked`; what every writer starts from."""
+    gaussians = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.items()})
+    return checked(gaussians.to("cpu").to(torch.float32), path, "Nothing was written.")
+
+
+def checked(gaussians: Gaussians, path: Path, consequence: str = "Remove or repair that splat.") -> Gaussians:
+    """The same record, or InputError naming path, property and row of what is not finite or not a rotation."""
+    _check_shapes(gaussians, path)
+    for name, tensor in gaussians.items():
+        # A sum is finite unless an element is not (or it overflows, which the slow look below settles).
+        if tensor.numel() and not bool(torch.isfinite(tensor.sum())) and not bool(torch.isfinite(tensor).all()):
+            index = torch.nonzero(~torch.isfinite(tensor))[0].tolist()
+            got = tensor[tuple(index)].item()
+            column = ply_name(name, index[1:], gaussians.shN.shape[1])
+            raise InputError(f"{path}: `{column}` of row {index[0]} must be finite, got {got}. {consequence}")
+    length2 = gaussians.quats.square().sum(dim=1)
+    if len(gaussians) and not bool(((length2 >= _TINY) & torch.isfinite(length2)).all()):
+        row = int(torch.nonzero(~((length2 >= _TINY) & torch.isfinite(length2)))[0])
+        got = gaussians.quats[row].tolist()
+        raise InputError(f"{path}: the rotation of row {row} must have a usable length, got {got}. {consequence}")
+    return gaussians
+
+
+def _check_shapes(gaussians: Gaussians, path: Path) -> None:
+    n, degree = len(gaussians), gaussians.sh_degree
+    if degree > MAX_SH_DEGREE:
+        raise InputError(f"{path}: SH degree must be 0 to {MAX_SH_DEGREE}, got {degree}. Call with_sh_degree(3) first.")
+    expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+    expected |= {"sh0": (n, 1, 3), "shN": (n, (degree + 1) ** 2 - 1, 3)}
+    for name, tensor in gaussians.items():
+        if tuple(tensor.shape) != expected[name]:
+            want, got = list(expected[name]), list(tensor.shape)
+            raise InputError(f"{path}: `{name}` must have shape {want}, got {got}. Give one row per splat.")
+
+
+def ply_name(parameter: str, index: list[int], bands: int) -> str:
+    """The Inria PLY's name for one column of a parameter, e.g. ("shN", [1, 2], 15) -> "f_rest_31"."""
+    if parameter == "means":
+        return _XYZ[index[0]]
+    if parameter == "shN":
+        return f"f_rest_{index[1] * bands + index[0]}"
+    if parameter == "sh0":
+        return f"f_dc_{index[1]}"
+    if parameter == "logit_opacities":
+        return "opacity"
+    return f"{'rot' if parameter == 'quats' else 'scale'}_{index[0]}"
+
+
+def logit(opacities: Tensor, quantum: float = 0.0) -> Tensor:
+    """ln(p / (1 - p)) of opacities in [0, 1], kept `quantum` away from the ends so that it stays finite."""
+    return torch.logit(opacities.double().clamp(quantum, 1.0 - quantum)).float()
