@@ -10,6 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt import check
+from gsopt.errors import InputError
+
+# Below this norm the square underflows in float32 and the rotation is lost.
+SMALLEST_QUAT = 1e-18
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -89,4 +93,11 @@ class Gaussians:
         for name, tensor in self.items():
             check.shape(name, tensor, expected[name])
             check.finite(name, tensor)
+        zero = torch.nonzero(torch.linalg.vector_norm(self.quats, dim=-1) < SMALLEST_QUAT)
+        if len(zero):
+            row = int(zero[0, 0])
+            raise InputError(
+                f"`quats` must not be zero, got {self.quats[row].tolist()} at row {row}. "
+                "Give a wxyz quaternion of any norm, or remove that row."
+            )
         return self

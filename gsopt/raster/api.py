@@ -1,0 +1,106 @@
+"""`rasterize`: Gaussians and cameras in, differentiable images out; and the choice of a backend."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gsopt import check
+from gsopt.cameras import Cameras
+from gsopt.errors import InputError, MissingDependency
+from gsopt.gaussians import Gaussians
+from gsopt.raster.autograd import draw
+from gsopt.raster.backend import Backend, RasterSettings
+
+BACKENDS = ("auto", "cpu", "reference")
+DEFAULT_SETTINGS = RasterSettings()
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What C cameras saw."""
+
+    colors: Float[Tensor, "C H W 3"]
+    """On the background that was given, else premultiplied."""
+    alphas: Float[Tensor, "C H W 1"]
+    depths: Float[Tensor, "C H W 1"] | None
+    """Expected depth along the viewing axis, scene units, 0 where nothing was hit; None unless asked for."""
+    radii: Int[Tensor, "C N 2"]
+    """Half-extent of each splat in px; 0 where it is not in the image."""
+
+
+def rasterize(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RasterSettings = DEFAULT_SETTINGS,
+    background: Float[Tensor, "3"] | None = None,
+    backend: Backend | str = "auto",
+    threads: int = 0,
+    depth: bool = False,
+) -> Rendering:
+    """Draw every camera. Differentiable, once, in the six parameters and the background (not in the cameras).
+
+    `backend` is a Backend or a name that `make_backend` knows; `threads` is heeded for a name only (0 = one per core).
+    Raises InputError for tensors of wrong shape, dtype or value, MissingDependency when the backend is not built.
+    """
+    _validate(gaussians, cameras, background)
+    engine = make_backend(backend, threads) if isinstance(backend, str) else backend
+    images = [draw(engine, gaussians, cameras[c], settings, background, depth) for c in range(len(cameras))]
+    colors = torch.stack([colors for colors, _, _, _ in images])
+    alphas = torch.stack([alphas for _, alphas, _, _ in images])
+    depths = torch.stack([depths for _, _, depths, _ in images if depths is not None]) if depth else None
+    return Rendering(
+        colors=colors,
+        alphas=alphas[..., None],
+        depths=None if depths is None else expected_depth(depths, alphas)[..., None],
+        radii=torch.stack([radii for _, _, _, radii in images]),
+    )
+
+
+def expected_depth(depths: Float[Tensor, "*C H W"], alphas: Float[Tensor, "*C H W"]) -> Float[Tensor, "*C H W"]:
+    """(Σ T alpha z) / alpha; 0 with zero gradient where alpha is 0."""
+    hit = alphas > 0
+    return torch.where(hit, depths / torch.where(hit, alphas, 1), 0)
+
+
+def make_backend(name: str = "auto", threads: int = 0) -> Backend:
+    """The backend of that name. "auto" is the compiled one of this machine, never the slow reference.
+
+    Raises UsageError for an unknown name, MissingDependency when the compiled extension is not built.
+    """
+    check.one_of("backend", name, BACKENDS)
+    check.at_least("threads", threads, 0, "0 takes one thread per core.")
+    if name == "reference":
+        from gsopt.raster.reference import ReferenceBackend
+
+        return ReferenceBackend()
+    try:
+        module = importlib.import_module("gsopt.raster.cpu_backend")
+    except ImportError as error:
+        raise MissingDependency(
+            f"The backend {name!r} needs gsopt's compiled rasteriser, which is not built ({error}). "
+            "Build it in the source folder with: pip install -e ."
+        ) from error
+    backend: Backend = module.CpuBackend(threads)
+    return backend
+
+
+def _validate(gaussians: Gaussians, cameras: Cameras, background: Tensor | None) -> None:
+    gaussians.validate()
+    cameras.validate()
+    if len(cameras) == 0:
+        raise InputError("`cameras` must hold at least one camera, got 0. Give viewmats of shape [C, 4, 4], C >= 1.")
+    wanted = gaussians.means.dtype, gaussians.means.device
+    for name, tensor in gaussians.items():
+        if tensor.dtype not in (torch.float32, torch.float64) or (tensor.dtype, tensor.device) != wanted:
+            raise InputError(
+                f"`{name}` must be float32 or float64 like `means` and beside it ({wanted[0]} on {wanted[1]}), "
+                f"got {tensor.dtype} on {tensor.device}. Convert the record with Gaussians.to()."
+            )
+    if background is not None:
+        check.shape("background", background, (3,))
+        check.finite("background", background)
