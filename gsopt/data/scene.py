@@ -5,11 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from gsopt.cameras import Cameras
-from gsopt.data.images import ImageStore
+from gsopt.config import DataConfig
+from gsopt.data import files
+from gsopt.data.colmap import find_model, read_colmap
+from gsopt.data.images import ImageStore, Picture, read_header, size_mismatch
+from gsopt.data.resample import downscaled_size
+from gsopt.data.source import Frame, Source
+from gsopt.data.split import split
+from gsopt.data.transforms import read_transforms
+from gsopt.data.undistort import Undistortion, choose_pinhole
+from gsopt.errors import InputError
+
+FAR_FROM_ORIGIN = 1e3
+"""Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +38,7 @@ class View:
     """Its row in the store."""
 
     def pixels(self) -> UInt8[Tensor, "H W C"]:
-        """sRGB-coded pixels, undistorted and downscaled; C = 4 (straight alpha) where there is alpha or a mask, else 3."""
+        """sRGB-coded pixels, undistorted and downscaled; C = 4 (straight alpha) with alpha or a mask, else 3."""
         return self.store.get(self.index)
 
 
@@ -39,7 +52,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a run learns from. World frame as in the source."""
+    """Everything a run learns from. World frame as in the source, less `origin`."""
 
     path: Path
     kind: str
@@ -53,3 +66,149 @@ class Scene:
     """True when every input view has alpha or a mask."""
     warnings: tuple[str, ...]
     """What the loader noticed (images absent, images skipped): shown to the user and kept with the run."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Subtracted from every source position; not zero only where coordinates were too large for float32."""
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the farthest input camera's distance from their mean (Kerbl et al. 2023), scene units.
+
+        Where the cameras stand in one place: their mean distance to the points, else 1.
+        """
+        centers = torch.cat([view.camera.centers for view in self.train])
+        radius = 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+        if radius > 1e-6:
+            return radius
+        if self.points is None or len(self.points.xyz) == 0:
+            return 1.0
+        return max(float((self.points.xyz - centers.mean(0)).norm(dim=1).mean()), 1e-6)
+
+
+def load_scene(config: DataConfig | str | Path) -> Scene:
+    """Read a NeRF-synthetic, nerfstudio/instant-ngp or COLMAP folder; a path stands for `DataConfig(path=...)`.
+
+    Images are opened for their size only; pixels are read when asked for. Raises InputError for anything wrong with
+    the folder and UsageError for `--views` and `--view-ids` that do not fit it.
+    """
+    if not isinstance(config, DataConfig):
+        config = DataConfig(path=str(config))
+    root = Path(config.path).expanduser()
+    source = _read(root)
+    if not source.frames:
+        raise InputError(f"{root} has no input view whose image exists. Restore the images, or give another folder.")
+    train, test = split(source, config)
+    if not train:
+        raise InputError(f"{root} has no input view left after the test views were held out. Add images.")
+    warnings = list(source.warnings)
+    origin = _origin(source.frames + (source.held_out or []), warnings)  # the same whichever views are chosen
+    views, has_alpha = _views(root, train + test, origin, config)
+    return Scene(
+        path=root,
+        kind=source.kind,
+        train=views[: len(train)],
+        test=views[len(train) :],
+        points=_points(source, origin),
+        has_alpha=all(has_alpha[: len(train)]),
+        warnings=tuple(warnings),
+        origin=(float(origin[0]), float(origin[1]), float(origin[2])),
+    )
+
+
+def _read(root: Path) -> Source:
+    if not root.is_dir():
+        raise InputError(
+            f"The dataset folder {root} does not exist or is no folder. Give the folder that holds the images."
+        )
+    if find_model(root) is not None:
+        return read_colmap(root)
+    if files.is_regular(root / "transforms_train.json") or files.is_regular(root / "transforms.json"):
+        return read_transforms(root)
+    raise InputError(
+        f"{root} holds no posed dataset. Looked for sparse/0 or sparse with cameras, images and points3D as .bin or "
+        ".txt (COLMAP), transforms_train.json (NeRF-synthetic) and transforms.json (nerfstudio, instant-ngp). "
+        "Photos alone have no poses yet: find them with `gsopt sfm`."
+    )
+
+
+def _origin(frames: list[Frame], warnings: list[str]) -> Float[Tensor, "3"]:
+    """Zero, or the rounded mean camera centre when the scene lies too far out for float32."""
+    centers = torch.stack([-frame.viewmat[:3, :3].T @ frame.viewmat[:3, 3] for frame in frames])
+    mean = centers.mean(0)
+    extent = 1.1 * float((centers - mean).norm(dim=1).max())
+    if float(mean.norm()) <= FAR_FROM_ORIGIN * (extent if extent > 1e-6 else 1.0):
+        return torch.zeros(3, dtype=torch.float64)
+    origin = mean.round() if extent > 1 else mean
+    moved = ", ".join(f"{value:.10g}" for value in origin.tolist())
+    warnings.append(
+        f"The cameras lie {float(mean.norm()):.4g} units from the origin but only {extent:.4g} apart: "
+        f"({moved}) is subtracted from every position, because 32-bit numbers would lose the detail."
+    )
+    return origin
+
+
+def _views(root: Path, frames: list[Frame], origin: Tensor, config: DataConfig) -> tuple[tuple[View, ...], list[bool]]:
+    """Views that share one store, and which of them have alpha."""
+    pinholes: dict[tuple[object, ...], Undistortion] = {}
+    prepared = [_prepare(root, frame, config.downscale, pinholes) for frame in frames]
+    store = ImageStore([picture for picture, _, _ in prepared], config.cache_mb)
+    views = tuple(
+        View(frame.name, _camera(frame, K, origin, picture), store, index)
+        for index, (frame, (picture, K, _)) in enumerate(zip(frames, prepared, strict=True))
+    )
+    return views, [alpha for _, _, alpha in prepared]
+
+
+def _prepare(
+    root: Path, frame: Frame, factor: int, pinholes: dict[tuple[object, ...], Undistortion]
+) -> tuple[Picture, Tensor, bool]:
+    """How the frame's file becomes working pixels, the pinhole K at working size, and whether there is alpha."""
+    path, stored = _stored_image(root, frame, factor)
+    width, height = (downscaled_size(extent, factor) for extent in (frame.width, frame.height))
+    K, undistortion = _resized(frame.K, (frame.width, frame.height), stored), None
+    if not frame.lens.is_pinhole:
+        key = (frame.lens, tuple(K.flatten().tolist()), stored)
+        if key not in pinholes:
+            pinholes[key] = choose_pinhole(frame.lens, K, *stored, where=str(frame.path))
+        undistortion = pinholes[key]
+        K = undistortion.pinhole
+    if path != frame.path:
+        width, height = stored
+    picture = Picture(path, frame.mask, stored, undistortion, width, height)
+    alpha = frame.mask is not None or read_header(path)[2]
+    return picture, _resized(K, stored, (width, height)), alpha
+
+
+def _stored_image(root: Path, frame: Frame, factor: int) -> tuple[Path, tuple[int, int]]:
+    """The file to read and its size: images_N/ when there is one for `factor`, else the frame's own."""
+    declared = (frame.width, frame.height)
+    name = Path(frame.name)
+    if factor > 1 and not name.is_absolute() and name.parts[0] == "images":
+        smaller = root.joinpath(f"images_{factor}", *name.parts[1:])
+        if files.is_regular(smaller):
+            width, height, _ = read_header(smaller)
+            # Published folders round up, down or to nearest.
+            if abs(width - declared[0] / factor) >= 1 or abs(height - declared[1] / factor) >= 1:
+                raise size_mismatch(smaller, (width, height), (frame.width // factor, frame.height // factor))
+            return smaller, (width, height)
+    width, height, _ = read_header(frame.path)
+    if (width, height) != declared:
+        raise size_mismatch(frame.path, (width, height), declared)
+    return frame.path, declared
+
+
+def _resized(K: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor:
+    """K for the same view at another size, by the true ratio of the two sizes."""
+    return K * torch.tensor([new[0] / old[0], new[1] / old[1], 1.0], dtype=K.dtype)[:, None]
+
+
+def _camera(frame: Frame, K: Tensor, origin: Tensor, picture: Picture) -> Cameras:
+    viewmat = frame.viewmat.clone()
+    viewmat[:3, 3] += viewmat[:3, :3] @ origin  # x_cam = R (x' + origin) + t
+    camera = Cameras(viewmat[None].float(), K[None].float(), picture.width, picture.height)
+    return camera.validate()
+
+
+def _points(source: Source, origin: Tensor) -> Points | None:
+    if source.xyz is None or source.rgb is None or len(source.xyz) == 0:
+        return None
+    return Points((source.xyz - origin).float(), source.rgb)

@@ -1,0 +1,71 @@
+"""What a reader hands to `load_scene`: frames in float64, as the files say, before anything is chosen or moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gsopt.data.lens import Lens
+from gsopt.errors import InputError
+
+RIGID_TOLERANCE = 1e-3
+"""Largest entry of |RᵀR - I|: files written with four digits pass, a scaled or sheared camera does not."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed image file."""
+
+    name: str
+    path: Path
+    mask: Path | None
+    viewmat: Float[Tensor, "4 4"]
+    """cam_from_world, OpenCV axes, float64."""
+    K: Float[Tensor, "3 3"]
+    """Pixels of the full-size stored image, before undistortion, float64."""
+    width: int
+    height: int
+    lens: Lens
+    position: int
+    """What `--view-ids` calls it: its row in the file (NeRF-synthetic), else its row in name order."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset as read."""
+
+    kind: str
+    frames: list[Frame]
+    """In the order that `--view-ids` counts."""
+    held_out: list[Frame] | None
+    """Frames the dataset itself holds out; None when it says nothing."""
+    xyz: Float[Tensor, "P 3"] | None = None
+    rgb: UInt8[Tensor, "P 3"] | None = None
+    warnings: list[str] = field(default_factory=list)
+
+
+def check_pose(matrix: Float[Tensor, "4 4"], where: str) -> None:
+    """InputError naming `where` unless the matrix is finite and rigid (a rotation and a translation)."""
+    remedy = "Correct or remove that frame."
+    if not bool(torch.isfinite(matrix).all()):
+        raise InputError(f"The pose of {where} is not finite (NaN or infinity in its matrix). {remedy}")
+    R = matrix[:3, :3]
+    deviation = float((R.T @ R - torch.eye(3).to(R)).abs().max())
+    if not deviation < RIGID_TOLERANCE or float(torch.linalg.det(R)) < 0:
+        what = "mirrored" if deviation < RIGID_TOLERANCE else f"not a rotation (off by {deviation:.3g})"
+        raise InputError(
+            f"The pose of {where} is not rigid: its 3x3 part is {what}. {remedy} Apply any camera scale first."
+        )
+    bottom = matrix[3].tolist()
+    if max(abs(a - b) for a, b in zip(bottom, (0, 0, 0, 1), strict=True)) > RIGID_TOLERANCE:
+        raise InputError(f"The pose of {where} is not rigid: its last row is {bottom}, not 0 0 0 1. {remedy}")
+
+
+def summarize_names(names: list[str], most: int = 5) -> str:
+    """The first few names and how many more there are, for a warning of one line."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,0 +1,68 @@
+"""Which frames a run learns from and which it is judged by."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.config import DataConfig
+from gsopt.data.source import Frame, Source
+from gsopt.errors import UsageError
+
+HOLD_OUT_EVERY = 8
+
+
+def split(source: Source, config: DataConfig) -> tuple[list[Frame], list[Frame]]:
+    """(train, test): the dataset's own test frames, else every 8th by name when `config.eval`, else no test."""
+    train, test = source.frames, source.held_out
+    if test is None:
+        by_name = sorted(train, key=lambda frame: frame.name)
+        test = by_name[::HOLD_OUT_EVERY] if config.eval else []
+        held_out = {id(frame) for frame in test}
+        train = [frame for frame in train if id(frame) not in held_out]
+    return _chosen(train, config, source.kind), test
+
+
+def _chosen(train: list[Frame], config: DataConfig, kind: str) -> list[Frame]:
+    if config.view_ids is not None:
+        return _by_ids(train, config.view_ids, kind)
+    if config.views is None:
+        return train
+    if config.views > len(train):
+        raise UsageError(
+            f"`--views` must be at most the {len(train)} input views there are, got {config.views}. Lower it."
+        )
+    centers = torch.stack([-frame.viewmat[:3, :3].T @ frame.viewmat[:3, 3] for frame in train])
+    return [train[row] for row in sorted(farthest_points(centers, config.views))]
+
+
+def _by_ids(train: list[Frame], ids: tuple[int, ...], kind: str) -> list[Frame]:
+    # NeRF-synthetic counts rows of the file, so that ids keep their meaning when an image is absent.
+    rows = {frame.position: frame for frame in train} if kind == "nerf-synthetic" else dict(enumerate(train))
+    if not ids:
+        raise UsageError("`--view-ids` is empty. Name at least one input view, or drop the flag.")
+    for view in ids:
+        if view not in rows:
+            last = max(rows)
+            reason = "its image is absent" if 0 <= view <= last else f"ids go from 0 to {last}"
+            raise UsageError(f"`--view-ids` names {view}, but {reason}. Choose another id.")
+    if len(set(ids)) < len(ids):
+        raise UsageError(f"`--view-ids` names a view twice: {list(ids)}. Name each once.")
+    return [rows[view] for view in ids]
+
+
+def farthest_points(points: Float[Tensor, "N 3"], count: int) -> list[int]:
+    """Rows of `count` well-spread points: the one closest to the mean, then always the one farthest from those chosen.
+
+    Ties go to the lowest row (Gonzalez 1985).
+    """
+    to_mean = (points - points.mean(0)).norm(dim=1)
+    chosen = [int(to_mean.numpy().argmin())]  # numpy: torch leaves open which of equals it returns
+    nearest = (points - points[chosen[0]]).norm(dim=1)
+    while len(chosen) < count:
+        nearest[chosen] = -1  # cameras at one place must not be chosen twice
+        row = int(nearest.numpy().argmax())
+        chosen.append(row)
+        nearest = torch.minimum(nearest, (points - points[row]).norm(dim=1))
+    return chosen
