@@ -19,7 +19,7 @@ from gsopt import quats as quaternions
 from gsopt import sh
 from gsopt.cameras import Cameras
 from gsopt.errors import UsageError
-from gsopt.gaussians import Gaussians
+from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster.backend import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -251,15 +251,16 @@ class ReferenceBackend:
             raise UsageError("This frame's backward pass already ran, or another backend drew it. Draw it again.")
         tape.used = True
         v = (
-            v_colors,
-            torch.zeros_like(tape.alphas) if v_alphas is None else v_alphas,
-            torch.zeros_like(tape.depths) if v_depths is None else v_depths,
+            v_colors.to(tape.colors),
+            torch.zeros_like(tape.alphas) if v_alphas is None else v_alphas.to(tape.alphas),
+            torch.zeros_like(tape.depths) if v_depths is None else v_depths.to(tape.depths),
         )
         means2d_abs = self._means2d_abs(tape, v) if absgrad else None
         inputs = [*(tensor for _, tensor in tape.leaves.items()), tape.offsets2d]
         image = (tape.colors, tape.alphas, tape.depths)
         *parameters, means2d = torch.autograd.grad(image, inputs, v, allow_unused=True, materialize_grads=True)
-        return Gradients(*parameters, means2d=means2d, means2d_abs=means2d_abs)
+        named = dict(zip(PARAMETERS, parameters, strict=True))
+        return Gradients(**named, means2d=means2d, means2d_abs=means2d_abs)
 
     def photometric(
         self, rendered: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], lambda_dssim: float
@@ -269,7 +270,7 @@ class ReferenceBackend:
             x = rendered.detach().clone().requires_grad_()
             l1, similarity, loss = photometric_terms(x, target.to(x), lambda_dssim)
             (v_colors,) = torch.autograd.grad(loss, x)
-        return Photometric(l1.item(), similarity.item(), loss.item(), v_colors)
+        return Photometric(l1.item(), similarity.item(), loss.item(), v_colors.contiguous())
 
     @torch.no_grad()
     def adam(

@@ -1,0 +1,161 @@
+// From a Gaussian in the world to a splat on the image plane, and the gradient on the way back.
+// F = float (one thread, one Gaussian) or a vector of floats; the including file provides sqrt, min, max, clamp,
+// select, exp, log2 and splat for F. Equations: docs/math.md, section "Projection".
+#pragma once
+#include "constants.h"
+
+namespace gsopt {
+
+struct Camera {
+  float R[9], t[3];  // cam_from_world, rows
+  float center[3];   // in the world
+  float fx, fy, cx, cy;
+  float x_min, x_max, y_min, y_max;  // bounds on t_x/t_z and t_y/t_z inside the Jacobian
+  float near_plane, far_plane, eps2d;
+  int width, height;
+  bool antialiased;
+};
+
+}  // namespace gsopt
+
+namespace gsopt::GSOPT_ISA {
+
+template <class F> struct Vec3 {
+  F x, y, z;
+};
+template <class F> inline Vec3<F> operator+(Vec3<F> a, Vec3<F> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class F> inline Vec3<F> operator-(Vec3<F> a, Vec3<F> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class F> inline Vec3<F> operator*(Vec3<F> a, F s) { return {a.x * s, a.y * s, a.z * s}; }
+template <class F> inline F dot(Vec3<F> a, Vec3<F> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class F> inline Vec3<F> cross(Vec3<F> a, Vec3<F> b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class F> inline Vec3<F> splat3(const float* p) { return {splat<F>(p[0]), splat<F>(p[1]), splat<F>(p[2])}; }
+
+// Columns of the rotation of a unit quaternion (w, x, y, z).
+template <class F> struct Rotation {
+  Vec3<F> c0, c1, c2;
+};
+template <class F> inline Rotation<F> rotation(F w, F x, F y, F z) {
+  const F one = splat<F>(1.f);
+  return {{one - (y * y + z * z) * 2.f, (x * y + w * z) * 2.f, (x * z - w * y) * 2.f},
+          {(x * y - w * z) * 2.f, one - (x * x + z * z) * 2.f, (y * z + w * x) * 2.f},
+          {(x * z + w * y) * 2.f, (y * z - w * x) * 2.f, one - (x * x + y * y) * 2.f}};
+}
+
+// One Gaussian (or a vector of them) as the optimiser stores it.
+template <class F> struct Splat3D {
+  Vec3<F> mean;
+  F qw, qx, qy, qz;
+  Vec3<F> log_scale;
+  F logit;
+};
+
+// Everything that forward and backward both need.
+template <class F> struct Projected {
+  Vec3<F> t;              // camera space
+  F iz, ux, uy, vx, vy;   // 1/t_z; t_x/t_z, t_y/t_z; the same clamped
+  F qn, qw, qx, qy, qz;   // norm of the quaternion, unit quaternion
+  Rotation<F> R;
+  Vec3<F> scale;
+  Vec3<F> T0, T1;         // rows of J W
+  Vec3<F> M0, M1;         // rows of J W R S: cov2d = M Mᵀ + eps2d
+  F mx, my, xx, xy, yy;   // mean2d and cov2d
+  F det0, det;            // determinants of M Mᵀ and of cov2d
+  F opacity;              // sigmoid, times the antialiasing factor
+  F sigmoid;
+};
+
+template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<F>& g) {
+  Projected<F> p;
+  const Vec3<F> W0 = splat3<F>(cam.R), W1 = splat3<F>(cam.R + 3), W2 = splat3<F>(cam.R + 6);
+  p.t = {dot(W0, g.mean) + cam.t[0], dot(W1, g.mean) + cam.t[1], dot(W2, g.mean) + cam.t[2]};
+  p.iz = splat<F>(1.f) / p.t.z;
+  p.ux = p.t.x * p.iz, p.uy = p.t.y * p.iz;
+  p.mx = p.ux * cam.fx + cam.cx, p.my = p.uy * cam.fy + cam.cy;
+  p.vx = clamp(p.ux, splat<F>(cam.x_min), splat<F>(cam.x_max));
+  p.vy = clamp(p.uy, splat<F>(cam.y_min), splat<F>(cam.y_max));
+  p.T0 = (W0 - W2 * p.vx) * (p.iz * cam.fx);
+  p.T1 = (W1 - W2 * p.vy) * (p.iz * cam.fy);
+
+  // Divide by the largest component first: the squares of tiny and huge quaternions would leave the range of float.
+  const F big = max(max(abs(g.qw), abs(g.qx)), max(abs(g.qy), abs(g.qz)));
+  const F ib = splat<F>(1.f) / big;
+  const F w = g.qw * ib, x = g.qx * ib, y = g.qy * ib, z = g.qz * ib;
+  const F norm = sqrt(w * w + x * x + y * y + z * z), in = splat<F>(1.f) / norm;
+  p.qn = norm * big;
+  p.qw = w * in, p.qx = x * in, p.qy = y * in, p.qz = z * in;
+  p.R = rotation(p.qw, p.qx, p.qy, p.qz);
+  p.scale = {exp(g.log_scale.x), exp(g.log_scale.y), exp(g.log_scale.z)};
+
+  p.M0 = {dot(p.T0, p.R.c0) * p.scale.x, dot(p.T0, p.R.c1) * p.scale.y, dot(p.T0, p.R.c2) * p.scale.z};
+  p.M1 = {dot(p.T1, p.R.c0) * p.scale.x, dot(p.T1, p.R.c1) * p.scale.y, dot(p.T1, p.R.c2) * p.scale.z};
+  const F d0 = dot(p.M0, p.M0), d1 = dot(p.M1, p.M1);
+  p.xx = d0 + cam.eps2d, p.yy = d1 + cam.eps2d, p.xy = dot(p.M0, p.M1);
+  // det(M Mᵀ) = |M0 x M1|²: no difference of large squares, so needles keep their width.
+  const Vec3<F> n = cross(p.M0, p.M1);
+  p.det0 = dot(n, n);
+  p.det = p.det0 + (d0 + d1) * cam.eps2d + cam.eps2d * cam.eps2d;
+
+  p.sigmoid = splat<F>(1.f) / (exp(splat<F>(0.f) - g.logit) + 1.f);
+  p.opacity = cam.antialiased ? p.sigmoid * sqrt(p.det0 / p.det) : p.sigmoid;
+  return p;
+}
+
+// dLoss/d(what the blending stage saw).
+template <class F> struct SplatGradient {
+  F mx, my;          // mean2d
+  F a, b, c;         // conic: exponent -(a dx² + 2 b dx dy + c dy²)/2
+  F log_opacity;     // natural logarithm of the effective opacity
+  F depth;
+};
+
+// Adds to v: mean, quaternion, log scale, logit.
+template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const SplatGradient<F>& v) {
+  const F idet = splat<F>(1.f) / p.det;
+  const F a = p.yy * idet, b = splat<F>(0.f) - p.xy * idet, c = p.xx * idet;
+  // cov2d: -Q G Q with Q the conic, G its gradient; xy counts both off-diagonal entries.
+  F xx = splat<F>(0.f) - (a * a * v.a + a * b * v.b + b * b * v.c);
+  F yy = splat<F>(0.f) - (b * b * v.a + b * c * v.b + c * c * v.c);
+  F xy = splat<F>(0.f) - (a * b * v.a * 2.f + (a * c + b * b) * v.b + b * c * v.c * 2.f);
+  if (cam.antialiased) {  // log opacity holds (log det0 - log det) / 2
+    const F h = v.log_opacity * 0.5f, h0 = h / max(p.det0, splat<F>(1e-30f));
+    xx = xx + h0 * (p.yy - cam.eps2d) - h * a;
+    yy = yy + h0 * (p.xx - cam.eps2d) - h * c;
+    xy = xy - (h0 * p.xy + h * b) * 2.f;
+  }
+  const Vec3<F> vM0 = p.M0 * (xx * 2.f) + p.M1 * xy, vM1 = p.M1 * (yy * 2.f) + p.M0 * xy;
+
+  Splat3D<F> out;
+  out.logit = v.log_opacity * (splat<F>(1.f) - p.sigmoid);
+  out.log_scale = {vM0.x * p.M0.x + vM1.x * p.M1.x, vM0.y * p.M0.y + vM1.y * p.M1.y, vM0.z * p.M0.z + vM1.z * p.M1.z};
+
+  const Vec3<F> P0 = {vM0.x * p.scale.x, vM0.y * p.scale.y, vM0.z * p.scale.z};
+  const Vec3<F> P1 = {vM1.x * p.scale.x, vM1.y * p.scale.y, vM1.z * p.scale.z};
+  const Vec3<F> r0 = p.T0 * P0.x + p.T1 * P1.x, r1 = p.T0 * P0.y + p.T1 * P1.y, r2 = p.T0 * P0.z + p.T1 * P1.z;
+  // dLoss/dR has columns r0, r1, r2; chain to the unit quaternion, then through the normalisation.
+  const F w = p.qw, x = p.qx, y = p.qy, z = p.qz;
+  const F a12 = r1.z - r2.y, a20 = r2.x - r0.z, a01 = r0.y - r1.x;
+  const F s01 = r1.x + r0.y, s02 = r2.x + r0.z, s12 = r2.y + r1.z;
+  const F gw = (x * a12 + y * a20 + z * a01) * 2.f;
+  const F gx = (y * s01 + z * s02 + w * a12 - x * (r1.y + r2.z) * 2.f) * 2.f;
+  const F gy = (x * s01 + z * s12 + w * a20 - y * (r0.x + r2.z) * 2.f) * 2.f;
+  const F gz = (x * s02 + y * s12 + w * a01 - z * (r0.x + r1.y) * 2.f) * 2.f;
+  const F radial = w * gw + x * gx + y * gy + z * gz, iq = splat<F>(1.f) / p.qn;
+  out.qw = (gw - w * radial) * iq, out.qx = (gx - x * radial) * iq;
+  out.qy = (gy - y * radial) * iq, out.qz = (gz - z * radial) * iq;
+
+  const Vec3<F> vT0 = p.R.c0 * P0.x + p.R.c1 * P0.y + p.R.c2 * P0.z;
+  const Vec3<F> vT1 = p.R.c0 * P1.x + p.R.c1 * P1.y + p.R.c2 * P1.z;
+  const Vec3<F> W0 = splat3<F>(cam.R), W1 = splat3<F>(cam.R + 3), W2 = splat3<F>(cam.R + 6);
+  const F h0 = p.iz * cam.fx, h1 = p.iz * cam.fy;
+  const F zero = splat<F>(0.f);
+  const F vux = v.mx * cam.fx + select(p.ux == p.vx, zero - h0 * dot(vT0, W2), zero);
+  const F vuy = v.my * cam.fy + select(p.uy == p.vy, zero - h1 * dot(vT1, W2), zero);
+  const F vtx = vux * p.iz, vty = vuy * p.iz;
+  const F vtz = v.depth - (dot(vT0, p.T0) + dot(vT1, p.T1) + vux * p.ux + vuy * p.uy) * p.iz;
+  out.mean = W0 * vtx + W1 * vty + W2 * vtz;
+  return out;
+}
+
+}  // namespace gsopt::GSOPT_ISA

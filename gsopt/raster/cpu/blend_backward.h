@@ -1,0 +1,209 @@
+// Stage 4: the gradient of compositing, back to front (docs/math.md, section "Compositing gradient").
+//
+// With q = c·g the splat's color projected on the pixel's gradient g, and A the same for everything behind it,
+// already composited, s = alpha dLoss/dalpha = w (q - A). Behind the last splat A = background·g - dLoss/dalpha_out.
+// T is recovered by dividing by 1 - alpha; it never falls below what the forward pass stopped at.
+//
+// Per block the work has two phases: pixels as lanes compute s and w for eight splats, then splats as lanes sum them
+// over the 16 pixels into moments about the tile's centre. Each (splat, tile) pair owns one row of sums, so no two
+// threads ever add to the same number and the result does not depend on their order.
+#pragma once
+#include "parallel.h"
+#include "tile.h"
+
+namespace gsopt::GSOPT_ISA {
+
+struct alignas(64) BlockGradient {
+  float T[kPixels], behind[kPixels], r[kPixels], g[kPixels], b[kPixels], depth[kPixels];
+  int32_t last[kPixels];
+  int32_t highest;  // largest `last`
+};
+
+inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile, int block, BlockGradient& out) {
+  std::memset(&out, 0, sizeof(out));
+  const int64_t at = (static_cast<int64_t>(tile) * kBlocks + block) * kPixels;
+  std::memcpy(out.T, frame.transmittance.as<float>() + at, sizeof(out.T));
+  std::memcpy(out.last, frame.last.as<int32_t>() + at, sizeof(out.last));
+  out.highest = -1;
+  for (int k = 0; k < kPixels; ++k) out.highest = out.last[k] > out.highest ? out.last[k] : out.highest;
+  const float* bg = frame.background;
+  for_each_pixel(frame, tile, block, [&](int64_t pixel, int lane) {
+    const float *v = in.v_colors + 3 * pixel, v_alpha = in.v_alphas ? in.v_alphas[pixel] : 0.f;
+    out.r[lane] = v[0], out.g[lane] = v[1], out.b[lane] = v[2];
+    out.depth[lane] = in.v_depths ? in.v_depths[pixel] : 0.f;
+    out.behind[lane] = v[0] * bg[0] + v[1] * bg[1] + v[2] * bg[2] - v_alpha;
+  });
+}
+
+// Eight splats between the two phases.
+struct alignas(64) Batch {
+  float s[kLanes][kPixels], w[kLanes][kPixels];
+  float abs_x[kLanes], abs_y[kLanes];
+  int index[kLanes];
+  int size = 0;
+};
+
+// 16 rows of 8 splats x 16 pixels become, per pixel, one vector over the splats.
+inline void pixels_by_splat(const float rows[kLanes][kPixels], f8 out[kPixels]) {
+  for (int h = 0; h < 2; ++h) {
+    for (int l = 0; l < kLanes; ++l) out[8 * h + l] = load8(rows[l] + 8 * h);
+    transpose8(out + 8 * h);
+  }
+}
+
+// Σ s, Σ s x, Σ s y, Σ s x², Σ s x y, Σ s y² over a block; x, y relative to the block's centre (±0.5, ±1.5).
+inline void block_moments(const f8 s[kPixels], f8 m[6]) {
+  f8 column[4], tilted[4], outer = splat<f8>(0.f), inner = outer;
+  for (int x = 0; x < 4; ++x) {
+    const f8 o = s[x] + s[12 + x], i = s[4 + x] + s[8 + x];
+    outer += o, inner += i, column[x] = o + i;
+    tilted[x] = (s[12 + x] - s[x]) * 1.5f + (s[8 + x] - s[4 + x]) * 0.5f;
+  }
+  m[0] = outer + inner;
+  m[1] = (column[3] - column[0]) * 1.5f + (column[2] - column[1]) * 0.5f;
+  m[2] = (tilted[0] + tilted[1]) + (tilted[2] + tilted[3]);
+  m[3] = (column[0] + column[3]) * 2.25f + (column[1] + column[2]) * 0.25f;
+  m[4] = (tilted[3] - tilted[0]) * 1.5f + (tilted[2] - tilted[1]) * 0.5f;
+  m[5] = outer * 2.25f + inner * 0.25f;
+}
+
+// Phase two: sums of a batch over the block, moved to the tile's centre and added to the splats' rows.
+template <bool Depth, bool Abs>
+inline void flush(Batch& batch, const BlockGradient& grad, int block, float (*rows)[kRow]) {
+  if (batch.size == 0) return;
+  for (int k = batch.size; k < kLanes; ++k) {
+    std::memset(batch.s[k], 0, sizeof(batch.s[k]));
+    std::memset(batch.w[k], 0, sizeof(batch.w[k]));
+  }
+  f8 pixel[kPixels], out[8], blue = splat<f8>(0.f), depth = blue;
+  pixels_by_splat(batch.s, pixel);
+  block_moments(pixel, out);
+  const float bx = static_cast<float>(4 * (block % 4)) - 6.f, by = static_cast<float>(4 * (block / 4)) - 6.f;
+  out[3] += (out[1] * 2.f + out[0] * bx) * bx;
+  out[4] += out[2] * bx + (out[1] + out[0] * bx) * by;
+  out[5] += (out[2] * 2.f + out[0] * by) * by;
+  out[1] += out[0] * bx, out[2] += out[0] * by;
+
+  pixels_by_splat(batch.w, pixel);
+  out[6] = out[7] = splat<f8>(0.f);
+  for (int k = 0; k < kPixels; ++k) {
+    out[6] += pixel[k] * grad.r[k], out[7] += pixel[k] * grad.g[k], blue += pixel[k] * grad.b[k];
+    if (Depth) depth += pixel[k] * grad.depth[k];
+  }
+  transpose8(out);
+  for (int k = 0; k < batch.size; ++k) {
+    float* row = rows[batch.index[k]];
+    store8(row, load8(row) + out[k]);
+    row[kWb] += blue[k];
+    if (Depth) row[kWz] += depth[k];
+    if (Abs) row[kAbsX] += batch.abs_x[k], row[kAbsY] += batch.abs_y[k];
+  }
+  batch.size = 0;
+}
+
+// Phase one over one chunk of one block, last splat first.
+template <bool Depth, bool Abs>
+inline void blend_block_backward(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first,
+                                 BlockGradient& grad, float (*rows)[kRow]) {
+  f16 X, Y;
+  block_pixels(block, X, Y);
+  f16 T = load16(grad.T), behind = load16(grad.behind);
+  const f16 gr = load16(grad.r), gg = load16(grad.g), gb = load16(grad.b), gz = load16(grad.depth);
+  const i16 last = load16i(grad.last);
+  const f16 threshold = splat<f16>(kLog2AlphaMin), alpha_max = splat<f16>(kAlphaMax), one = splat<f16>(1.f);
+  Batch batch;
+  for (int w = n_words - 1; w >= 0; --w) {
+    uint64_t rest = words[w][block];
+    const int above = grad.highest - first - 64 * w;  // splats after the block's last one contributed nothing
+    if (above < 63) rest &= above < 0 ? 0 : (uint64_t{2} << above) - 1;
+    while (rest) {
+      const int bit = 63 - __builtin_clzll(rest), j = 64 * w + bit;
+      rest ^= uint64_t{1} << bit;
+      const f16 u = splat<f16>(local.A[j]) * X + (splat<f16>(local.B[j]) * Y + splat<f16>(local.u0[j]));
+      const f16 v = splat<f16>(local.C[j]) * Y + splat<f16>(local.v0[j]);
+      const f16 e = splat<f16>(local.log2_opacity[j]) - u * u - v * v;
+      const i16 pass = (e >= threshold) & (last >= splat16i(first + j));
+      const f16 raw = exp2(e);
+      const f16 alpha = keep(pass, min(raw, alpha_max));
+      T = T * (one / (one - alpha));
+      const f16 weight = alpha * T;
+      f16 q = splat<f16>(local.r[j]) * gr + splat<f16>(local.g[j]) * gg + splat<f16>(local.b[j]) * gb;
+      if (Depth) q = q + splat<f16>(local.depth[j]) * gz;
+      const f16 difference = q - behind;
+      behind = behind + alpha * difference;
+      const f16 s = keep(raw < alpha_max, weight * difference);  // a clamped alpha does not move
+      const int k = batch.size;
+      batch.index[k] = j;
+      store16(batch.s[k], s), store16(batch.w[k], weight);
+      if (Abs) {
+        batch.abs_x[k] = sum(abs(s * u)) * local.A[j] * (1.f / kHalfLog2E);
+        batch.abs_y[k] = sum(abs(s * (splat<f16>(local.B[j]) * u + splat<f16>(local.C[j]) * v))) * (1.f / kHalfLog2E);
+      }
+      if (++batch.size == kLanes) flush<Depth, Abs>(batch, grad, block, rows);
+    }
+  }
+  flush<Depth, Abs>(batch, grad, block, rows);
+  store16(grad.T, T), store16(grad.behind, behind);
+}
+
+// Moments about the tile's centre become moments about each splat's own centre; the rows go to their slots.
+inline void store_rows(const Local& local, const Entry* entries, int n, float (*rows)[kRow], float* out) {
+  for (int i = 0; i < n; i += kLanes) {
+    f8 m[8];
+    for (int l = 0; l < kLanes; ++l) m[l] = load8(rows[i + l]);
+    transpose8(m);
+    const f8 dx = load8(local.dx + i), dy = load8(local.dy + i);
+    m[kSxx] += (m[kS] * dx - m[kSx] * 2.f) * dx;
+    m[kSxy] += m[kS] * dx * dy - m[kSy] * dx - m[kSx] * dy;
+    m[kSyy] += (m[kS] * dy - m[kSy] * 2.f) * dy;
+    m[kSx] -= m[kS] * dx, m[kSy] -= m[kS] * dy;
+    transpose8(m);
+    for (int l = 0; l < kLanes && i + l < n; ++l) {
+      float* row = out + static_cast<int64_t>(entries[i + l].slot) * kRow;
+      store8(row, m[l]), store8(row + 8, load8(rows[i + l] + 8));
+    }
+  }
+}
+
+inline void clear_rows(const Entry* entries, uint32_t from, uint32_t to, float* out) {
+  for (uint32_t k = from; k < to; ++k) std::memset(out + static_cast<int64_t>(entries[k].slot) * kRow, 0, sizeof(float) * kRow);
+}
+
+template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& frame, int tile, const BackwardInput& in) {
+  const uint32_t begin = frame.tile_begin.as<uint32_t>()[tile];
+  const uint32_t count = frame.tile_begin.as<uint32_t>()[tile + 1] - begin;
+  if (count == 0) return;
+  const Entry* entries = frame.entries.as<Entry>() + begin;
+  const auto* words = reinterpret_cast<const uint64_t(*)[kBlocks]>(frame.words.as<uint64_t>()) + frame.word_begin.as<uint32_t>()[tile];
+  const TileGeometry geometry = tile_geometry(frame, tile);
+  BlockGradient grad[kBlocks];
+  int highest = -1;
+  for (int block = 0; block < kBlocks; ++block) {
+    load_gradient(frame, in, tile, block, grad[block]);
+    highest = grad[block].highest > highest ? grad[block].highest : highest;
+  }
+  const uint32_t used = static_cast<uint32_t>(highest + 1);
+  clear_rows(entries, used, count, frame.rows.as<float>());
+  Local local;
+  alignas(64) float rows[kChunk][kRow];
+  for (int chunk = divide_up(used, kChunk) - 1; chunk >= 0; --chunk) {
+    const uint32_t first = static_cast<uint32_t>(chunk) * kChunk;
+    const int n = used - first < kChunk ? static_cast<int>(used - first) : kChunk, padded = (n + kLanes - 1) / kLanes * kLanes;
+    load_chunk(frame, entries + first, n, geometry, local, nullptr);
+    std::memset(rows, 0, sizeof(rows[0]) * padded);
+    for (int block = 0; block < kBlocks; ++block) {
+      if (grad[block].highest < static_cast<int>(first)) continue;
+      blend_block_backward<Depth, Abs>(local, words + first / 64, (n + 63) / 64, block, static_cast<int>(first), grad[block], rows);
+    }
+    store_rows(local, entries + first, n, rows, frame.rows.as<float>());
+  }
+}
+
+inline void blend_backward_stage(Pool& pool, Frame& frame, const BackwardInput& in, bool absgrad) {
+  const bool depth = in.v_depths != nullptr;
+  const auto tile_backward = depth ? (absgrad ? blend_tile_backward<true, true> : blend_tile_backward<true, false>)
+                                   : (absgrad ? blend_tile_backward<false, true> : blend_tile_backward<false, false>);
+  parallel(pool, frame.tiles(), [&](int tile, int) { tile_backward(frame, tile, in); });
+}
+
+}  // namespace gsopt::GSOPT_ISA

@@ -1,0 +1,118 @@
+// What one camera's forward pass leaves for its backward pass, and the table of kernels of one instruction set.
+// Plain data and pointers: the files compiled for one instruction set include this and nothing that allocates.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "../common/projection.h"
+#include "pool.h"
+
+namespace gsopt {
+
+constexpr int kTile = 16;         // pixels along a tile's side
+constexpr int kBlocks = 16;       // 4x4-pixel blocks in a tile
+constexpr int kChunk = 256;       // splats of a tile that are worked on at once
+constexpr int kProjectChunk = 1024;
+
+// Grows, never shrinks, 64-byte aligned; contents are lost when it grows.
+class Buffer {
+ public:
+  Buffer() = default;
+  ~Buffer();
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  void reserve(size_t bytes);
+  template <class T> T* as() const { return static_cast<T*>(data_); }
+  size_t bytes() const { return capacity_; }
+
+ private:
+  void* data_ = nullptr;
+  size_t capacity_ = 0;
+};
+
+// A splat on the image plane: exponent in base 2 is log2_opacity - (A dx + B dy)² - (C dy)².
+struct alignas(64) Record {
+  float mx, my, A, B, C, log2_opacity, r, g;
+  float b, depth;
+  uint16_t x0, x1, y0, y1;  // tiles, half open
+  uint32_t slot, count;     // its intersections with tiles: rows [slot, slot + count) of the gradient buffer
+  uint32_t pad[2];
+};
+static_assert(sizeof(Record) == 64);
+
+// One splat in one tile.
+struct Entry {
+  uint32_t id, slot;
+};
+
+// One row of gradient sums per entry: moments of s about the splat's centre, then color, depth, |gradient|.
+enum RowField { kS, kSx, kSy, kSxx, kSxy, kSyy, kWr, kWg, kWb, kWz, kAbsX, kAbsY, kRow = 16 };
+
+struct Parameters {
+  int64_t count;
+  int sh_degree, sh_rest;  // highest band to evaluate; number of rows of shN
+  const float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN;
+};
+
+struct ParameterGradients {
+  float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;  // last may be null
+};
+
+struct Frame {
+  Camera camera;
+  float background[3];
+  int sh_degree = 0, tiles_x = 0, tiles_y = 0;
+  int64_t count = 0, visible = 0, intersections = 0;
+  bool depth = false;
+  Buffer records;            // Record[count]
+  Buffer keys, order;        // uint32[count]: depth bits, ids, sorted front to back
+  Buffer keys2, order2;      // scratch of the sort
+  Buffer histogram, chunks;  // scratch of sort and binning
+  Buffer tile_begin;         // uint32[tiles + 1]: first entry of a tile
+  Buffer word_begin;         // uint32[tiles + 1]: first mask word of a tile
+  Buffer entries;            // Entry[intersections]
+  Buffer words;              // uint64[words][kBlocks]: bit k of word w: does splat 64 w + k touch the block?
+  Buffer transmittance;      // float[tiles][kBlocks][16]
+  Buffer last;               // int32[tiles][kBlocks][16]: last contributing entry of the tile, -1 if none
+  Buffer rows;               // float[intersections][kRow]
+  int tiles() const { return tiles_x * tiles_y; }
+};
+
+struct ForwardOutput {
+  float *colors, *alphas, *depths;  // [H,W,3], [H,W], [H,W] or null
+  int32_t* radii;                   // [N,2]
+};
+
+struct BackwardInput {
+  const float *v_colors, *v_alphas, *v_depths;  // last two may be null
+};
+
+struct PhotometricArguments {
+  const float *rendered, *target;  // [H,W,3]
+  float* v_rendered;
+  int height, width;
+  float lambda_dssim;
+  Buffer* scratch;
+  double l1, ssim;  // out: means
+};
+
+struct AdamArguments {
+  float *param, *exp_avg, *exp_avg_sq;
+  const float* grad;
+  int64_t rows, stride, active;  // the first `active` floats of each row of `stride` are stepped
+  float step_size, beta1, beta2, inv_sqrt_correction2, eps;
+};
+
+// The kernels of one instruction set.
+struct Kernels {
+  const char* name;
+  void (*project)(Pool&, Frame&, const Parameters&, int32_t* radii);
+  void (*bin)(Pool&, Frame&);
+  void (*blend)(Pool&, Frame&, const ForwardOutput&);
+  void (*blend_backward)(Pool&, Frame&, const BackwardInput&, bool absgrad);
+  void (*project_backward)(Pool&, Frame&, const Parameters&, const ParameterGradients&);
+  void (*photometric)(Pool&, PhotometricArguments&);
+  void (*adam)(Pool&, const AdamArguments&);
+};
+
+}  // namespace gsopt

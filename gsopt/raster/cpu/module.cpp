@@ -1,0 +1,224 @@
+// The Python side of the CPU kernels: arrays in and out by DLPack, no torch, the GIL released while kernels run.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <vector>
+
+#include "frame.h"
+
+namespace nb = nanobind;
+
+namespace gsopt {
+
+#if defined(GSOPT_HAVE_AVX512)
+namespace avx512 { extern const Kernels kernels; }
+#endif
+#if defined(GSOPT_HAVE_AVX2)
+namespace avx2 { extern const Kernels kernels; }
+#endif
+namespace portable { extern const Kernels kernels; }
+
+namespace {
+
+using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
+
+// Those this processor can run, best first.
+std::vector<const Kernels*> available_kernels() {
+  std::vector<const Kernels*> found;
+#if defined(GSOPT_HAVE_AVX512)
+  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
+      __builtin_cpu_supports("avx512vl"))
+    found.push_back(&avx512::kernels);
+#endif
+#if defined(GSOPT_HAVE_AVX2)
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&avx2::kernels);
+#endif
+  found.push_back(&portable::kernels);
+  return found;
+}
+
+const Kernels* choose_kernels(const std::string& name) {
+  const auto found = available_kernels();
+  if (name.empty()) return found.front();
+  std::string names;
+  for (const Kernels* k : found) {
+    if (name == k->name) return k;
+    names += std::string(names.empty() ? "" : ", ") + k->name;
+  }
+  throw std::invalid_argument("instruction set `" + name + "` is not available here. Choose one of: " + names);
+}
+
+struct Workspace {
+  Pool pool;
+  const Kernels* kernels;
+  Buffer scratch;
+  Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) {}
+};
+
+template <class Array> auto* data_of(const Array& a, size_t size, const char* name) {
+  if (a.size() != size) throw std::invalid_argument(std::string(name) + ": wrong number of elements");
+  return a.data();
+}
+
+struct Model {
+  In means, quats, log_scales, logit_opacities, sh0, shN;
+};
+
+Parameters parameters_of(const Model& m, int sh_degree) {
+  const size_t n = m.logit_opacities.size();
+  const int rest = n ? static_cast<int>(m.shN.size() / (3 * n)) : 0;
+  if ((sh_degree + 1) * (sh_degree + 1) - 1 > rest && n) throw std::invalid_argument("shN holds fewer bands than sh_degree asks for");
+  return {static_cast<int64_t>(n),
+          sh_degree,
+          rest,
+          data_of(m.means, 3 * n, "means"),
+          data_of(m.quats, 4 * n, "quats"),
+          data_of(m.log_scales, 3 * n, "log_scales"),
+          m.logit_opacities.data(),
+          data_of(m.sh0, 3 * n, "sh0"),
+          data_of(m.shN, 3 * n * rest, "shN")};
+}
+
+// viewmat [4,4], K [3,3] row-major double: the centre is found in double so that far-away scenes keep their precision.
+Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, int width, int height, double near_plane,
+                   double far_plane, double eps2d, bool antialiased) {
+  if (V.size() != 16 || K.size() != 9 || width < 1 || height < 1) throw std::invalid_argument("camera: wrong number of elements");
+  Camera c;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) c.R[3 * i + j] = static_cast<float>(V[4 * i + j]);
+    c.t[i] = static_cast<float>(V[4 * i + 3]);
+  }
+  for (int j = 0; j < 3; ++j) {
+    double s = 0;
+    for (int i = 0; i < 3; ++i) s -= V[4 * i + j] * V[4 * i + 3];
+    c.center[j] = static_cast<float>(s);
+  }
+  const double fx = K[0], fy = K[4], cx = K[2], cy = K[5], margin_x = kViewMargin * 0.5 * width / fx, margin_y = kViewMargin * 0.5 * height / fy;
+  c.fx = static_cast<float>(fx), c.fy = static_cast<float>(fy), c.cx = static_cast<float>(cx), c.cy = static_cast<float>(cy);
+  c.x_min = static_cast<float>(-(cx / fx + margin_x)), c.x_max = static_cast<float>((width - cx) / fx + margin_x);
+  c.y_min = static_cast<float>(-(cy / fy + margin_y)), c.y_max = static_cast<float>((height - cy) / fy + margin_y);
+  c.near_plane = static_cast<float>(near_plane), c.far_plane = static_cast<float>(far_plane), c.eps2d = static_cast<float>(eps2d);
+  c.width = width, c.height = height, c.antialiased = antialiased;
+  return c;
+}
+
+void reserve_frame(Frame& f, int64_t n) {
+  f.records.reserve(sizeof(Record) * (n + 1));
+  for (Buffer* b : {&f.keys, &f.order, &f.keys2, &f.order2}) b->reserve(sizeof(uint32_t) * (n + kProjectChunk));
+  f.chunks.reserve(sizeof(uint32_t) * (n / kProjectChunk + 1));
+  for (Buffer* b : {&f.tile_begin, &f.word_begin}) b->reserve(sizeof(uint32_t) * (f.tiles() + 1));
+  for (Buffer* b : {&f.transmittance, &f.last}) b->reserve(sizeof(float) * kTile * kTile * static_cast<size_t>(f.tiles()));
+}
+
+void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, const Camera& camera, std::tuple<float, float, float> background,
+             Out colors, Out alphas, std::optional<Out> depths, OutInt radii) {
+  const Parameters P = parameters_of(model, sh_degree);
+  const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
+  const ForwardOutput out = {data_of(colors, 3 * pixels, "colors"), data_of(alphas, pixels, "alphas"),
+                             depths ? data_of(*depths, pixels, "depths") : nullptr,
+                             data_of(radii, 2 * static_cast<size_t>(P.count), "radii")};
+  nb::gil_scoped_release release;
+  frame.camera = camera;
+  frame.background[0] = std::get<0>(background), frame.background[1] = std::get<1>(background), frame.background[2] = std::get<2>(background);
+  frame.sh_degree = sh_degree, frame.count = P.count;
+  frame.tiles_x = (camera.width + kTile - 1) / kTile, frame.tiles_y = (camera.height + kTile - 1) / kTile;
+  if (frame.tiles_x > 65535 || frame.tiles_y > 65535) throw std::invalid_argument("the image is wider or higher than 1,048,560 pixels");
+  reserve_frame(frame, P.count);
+  ws.kernels->project(ws.pool, frame, P, out.radii);
+  ws.kernels->bin(ws.pool, frame);
+  ws.kernels->blend(ws.pool, frame, out);
+}
+
+struct Gradient {
+  Out means, quats, log_scales, logit_opacities, sh0, shN, means2d;
+  std::optional<Out> means2d_abs;
+};
+
+void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std::optional<In> v_alphas, std::optional<In> v_depths, Gradient& g) {
+  const Parameters P = parameters_of(model, frame.sh_degree);
+  if (P.count != frame.count) throw std::invalid_argument("backward: not the Gaussians that the frame was drawn from");
+  const size_t n = static_cast<size_t>(P.count), pixels = static_cast<size_t>(frame.camera.width) * frame.camera.height;
+  const BackwardInput in = {data_of(v_colors, 3 * pixels, "v_colors"), v_alphas ? data_of(*v_alphas, pixels, "v_alphas") : nullptr,
+                            v_depths ? data_of(*v_depths, pixels, "v_depths") : nullptr};
+  const ParameterGradients out = {data_of(g.means, 3 * n, "v_means"),
+                                  data_of(g.quats, 4 * n, "v_quats"),
+                                  data_of(g.log_scales, 3 * n, "v_log_scales"),
+                                  data_of(g.logit_opacities, n, "v_logit_opacities"),
+                                  data_of(g.sh0, 3 * n, "v_sh0"),
+                                  data_of(g.shN, 3 * n * P.sh_rest, "v_shN"),
+                                  data_of(g.means2d, 2 * n, "v_means2d"),
+                                  g.means2d_abs ? data_of(*g.means2d_abs, 2 * n, "v_means2d_abs") : nullptr};
+  nb::gil_scoped_release release;
+  frame.rows.reserve(sizeof(float) * kRow * frame.intersections);
+  ws.kernels->blend_backward(ws.pool, frame, in, out.means2d_abs != nullptr);
+  ws.kernels->project_backward(ws.pool, frame, P, out);
+}
+
+std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Out v_rendered, int height, int width, float lambda_dssim) {
+  const size_t size = 3 * static_cast<size_t>(height) * width;
+  PhotometricArguments a = {data_of(rendered, size, "rendered"), data_of(target, size, "target"), data_of(v_rendered, size, "v_rendered"),
+                            height, width, lambda_dssim, &ws.scratch, 0, 0};
+  nb::gil_scoped_release release;
+  ws.kernels->photometric(ws.pool, a);
+  return {a.l1, a.ssim};
+}
+
+void adam(Workspace& ws, Out param, In grad, Out exp_avg, Out exp_avg_sq, int64_t rows, int64_t active, double lr, double beta1,
+          double beta2, double eps, int64_t step) {
+  const size_t size = param.size();
+  if (rows == 0 || size == 0) return;
+  const double c1 = 1.0 - std::pow(beta1, static_cast<double>(step)), c2 = 1.0 - std::pow(beta2, static_cast<double>(step));
+  const AdamArguments a = {param.data(), data_of(exp_avg, size, "exp_avg"), data_of(exp_avg_sq, size, "exp_avg_sq"), data_of(grad, size, "grad"),
+                           rows, static_cast<int64_t>(size) / rows, active, static_cast<float>(lr / c1), static_cast<float>(beta1),
+                           static_cast<float>(beta2), static_cast<float>(1.0 / std::sqrt(c2)), static_cast<float>(eps)};
+  nb::gil_scoped_release release;
+  ws.kernels->adam(ws.pool, a);
+}
+
+}  // namespace
+
+NB_MODULE(_cpu, m) {
+  m.doc() = "CPU kernels of gsopt.raster; used through gsopt.raster.cpu_backend.";
+  m.def("instruction_sets", [] {
+    std::vector<std::string> names;
+    for (const Kernels* k : available_kernels()) names.emplace_back(k->name);
+    return names;
+  });
+  nb::class_<Workspace>(m, "Workspace")
+      .def(nb::init<int, const std::string&>(), nb::arg("threads"), nb::arg("isa"))
+      .def_prop_ro("isa", [](const Workspace& w) { return std::string(w.kernels->name); })
+      .def_prop_ro("threads", [](const Workspace& w) { return w.pool.threads(); });
+  nb::class_<Frame>(m, "Frame")
+      .def(nb::init<>())
+      .def_ro("visible", &Frame::visible)
+      .def_ro("intersections", &Frame::intersections);
+  nb::class_<Camera>(m, "Camera")
+      .def("__init__", [](Camera* self, const std::vector<double>& V, const std::vector<double>& K, int width, int height, double near_plane,
+                          double far_plane, double eps2d, bool antialiased) {
+        new (self) Camera(make_camera(V, K, width, height, near_plane, far_plane, eps2d, antialiased));
+      });
+  nb::class_<Model>(m, "Model").def(nb::init<In, In, In, In, In, In>());
+  nb::class_<Gradient>(m, "Gradient")
+      .def("__init__", [](Gradient* self, Out means, Out quats, Out log_scales, Out logit_opacities, Out sh0, Out shN, Out means2d,
+                          std::optional<Out> means2d_abs) {
+        new (self) Gradient{means, quats, log_scales, logit_opacities, sh0, shN, means2d, means2d_abs};
+      }, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
+  m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg());
+  m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg());
+  m.def("photometric", &photometric);
+  m.def("adam", &adam);
+}
+
+}  // namespace gsopt

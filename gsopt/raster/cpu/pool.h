@@ -1,0 +1,43 @@
+// A small thread pool: workers spin for a moment, then sleep; work is handed out by an atomic counter.
+// Results never depend on which worker takes which item.
+#pragma once
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace gsopt {
+
+class Pool {
+ public:
+  explicit Pool(int threads);
+  ~Pool();
+  Pool(const Pool&) = delete;
+  Pool& operator=(const Pool&) = delete;
+
+  int threads() const { return static_cast<int>(workers_.size()) + 1; }
+
+  // Plain function and context: nothing here is instantiated in a file compiled for one instruction set only.
+  using Task = void (*)(void* context, int item, int worker);
+
+  // Calls task(context, item, worker) once for every item in [0, items); returns when all are done.
+  // Calls from several threads take turns.
+  void run(int items, Task task, void* context);
+
+ private:
+  void work(int worker);
+  void take(int worker);
+
+  std::vector<std::thread> workers_;
+  std::mutex turn_, mutex_;
+  std::condition_variable wake_;
+  std::atomic<uint64_t> generation_{0};
+  std::atomic<int> next_{0}, busy_{0};
+  int items_ = 0;
+  Task task_ = nullptr;
+  void* context_ = nullptr;
+  bool stop_ = false;
+};
+
+}  // namespace gsopt

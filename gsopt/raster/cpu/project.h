@@ -1,0 +1,251 @@
+// Stage 1 and its mirror image: Gaussians to splats, eight at a time, and gradients of splats to gradients of Gaussians.
+#pragma once
+#include "../common/sh.h"
+#include "frame.h"
+#include "parallel.h"
+#include "simd.h"
+
+namespace gsopt::GSOPT_ISA {
+
+// Eight Gaussians from arrays of structures to one vector per field. `rows` may repeat an index: the tail is padded.
+inline Splat3D<f8> load_splats(const Parameters& P, const int64_t rows[kLanes]) {
+  alignas(32) float v[11][kLanes];
+  for (int l = 0; l < kLanes; ++l) {
+    const int64_t n = rows[l];
+    const float *m = P.means + 3 * n, *q = P.quats + 4 * n, *s = P.log_scales + 3 * n;
+    v[0][l] = m[0], v[1][l] = m[1], v[2][l] = m[2];
+    v[3][l] = q[0], v[4][l] = q[1], v[5][l] = q[2], v[6][l] = q[3];
+    v[7][l] = s[0], v[8][l] = s[1], v[9][l] = s[2];
+    v[10][l] = P.logit_opacities[n];
+  }
+  f8 f[11];
+  for (int k = 0; k < 11; ++k) f[k] = load8(v[k]);
+  return {{f[0], f[1], f[2]}, f[3], f[4], f[5], f[6], {f[7], f[8], f[9]}, f[10]};
+}
+
+inline Vec3<f8> view_directions(const Camera& cam, const Vec3<f8>& mean, f8& inverse_distance) {
+  const Vec3<f8> d = {mean.x - cam.center[0], mean.y - cam.center[1], mean.z - cam.center[2]};
+  inverse_distance = splat<f8>(1.f) / sqrt(max(dot(d, d), splat<f8>(1e-30f)));
+  return d * inverse_distance;
+}
+
+// Bands 1.. of a row of shN as 4-float groups (r, g, b, next r): the fourth lane is dropped later. The last
+// coefficient of the last row would read past the end, so it is put together by hand.
+inline f4 load_rgb(const float* sh, bool last) { return last ? f4{sh[0], sh[1], sh[2], 0.f} : load4(sh); }
+
+inline f4 sh_color(const Parameters& P, int64_t n, const float Y[][kLanes], int lane, int bands) {
+  const float *dc = P.sh0 + 3 * n, *rest = P.shN + 3 * P.sh_rest * n;
+  f4 c = f4{dc[0], dc[1], dc[2], 0.f} * kSH0 + 0.5f;
+  for (int k = 0; k < bands; ++k) c += load_rgb(rest + 3 * k, k == P.sh_rest - 1) * Y[k][lane];
+  return c;
+}
+
+struct TileBox {
+  int x0, x1, y0, y1;
+};
+inline int clamp_int(float x, int high) {  // floor for x >= 0, safe for any x
+  return x <= 0.f ? 0 : (x >= static_cast<float>(high) ? high : static_cast<int>(x));
+}
+inline TileBox tile_box(const Frame& frame, float mx, float my, float rx, float ry) {
+  constexpr float inv = 1.f / kTile;
+  return {clamp_int((mx - rx) * inv, frame.tiles_x), clamp_int((mx + rx) * inv + 1.f, frame.tiles_x),
+          clamp_int((my - ry) * inv, frame.tiles_y), clamp_int((my + ry) * inv + 1.f, frame.tiles_y)};
+}
+
+// One vector of Gaussians; returns how many ids were appended to `ids`.
+inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, uint32_t* ids) {
+  const Camera& cam = frame.camera;
+  int64_t index[kLanes];
+  for (int l = 0; l < kLanes; ++l) index[l] = first + (l < lanes ? l : 0);
+  const Splat3D<f8> g = load_splats(P, index);
+  const Projected<f8> p = project(cam, g);
+
+  const f8 k = splat<f8>(kHalfLog2E);
+  const f8 A = sqrt(k * p.yy / p.det), B = splat<f8>(0.f) - A * (p.xy / p.yy), C = sqrt(k / p.yy);
+  const f8 lo = log2(max(p.opacity, splat<f8>(1e-37f)));
+  const f8 reach = max(lo - kLog2AlphaMin, splat<f8>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
+  const f8 rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
+  const i8 ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det > 0.f) &
+                (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) & (p.my + ry > 0.f) &
+                (p.my - ry < static_cast<float>(cam.height));
+  const int mask = movemask(ok) & ((1 << lanes) - 1);
+
+  alignas(32) float Y[15][kLanes], out[10][kLanes], rad[2][kLanes];
+  const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
+  if (mask) {
+    f8 basis[15], inv;
+    const Vec3<f8> d = view_directions(cam, g.mean, inv);
+    sh_basis(frame.sh_degree, d.x, d.y, d.z, basis);
+    for (int b = 0; b < bands; ++b) store8(Y[b], basis[b]);
+    const f8 fields[8] = {p.mx, p.my, A, B, C, lo, p.t.z, p.t.z};
+    for (int f = 0; f < 7; ++f) store8(out[f], fields[f]);
+    store8(rad[0], rx), store8(rad[1], ry);
+  }
+  Record* records = frame.records.as<Record>();
+  int found = 0;
+  for (int l = 0; l < lanes; ++l) {
+    Record& r = records[first + l];
+    r.count = 0;
+    radii[2 * (first + l)] = radii[2 * (first + l) + 1] = 0;
+    if (!(mask >> l & 1)) continue;
+    const f4 c = sh_color(P, first + l, Y, l, bands);
+    r.mx = out[0][l], r.my = out[1][l], r.A = out[2][l], r.B = out[3][l], r.C = out[4][l], r.log2_opacity = out[5][l];
+    r.r = c[0] > 0.f ? c[0] : 0.f, r.g = c[1] > 0.f ? c[1] : 0.f, r.b = c[2] > 0.f ? c[2] : 0.f, r.depth = out[6][l];
+    const TileBox box = tile_box(frame, r.mx, r.my, rad[0][l], rad[1][l]);
+    r.x0 = static_cast<uint16_t>(box.x0), r.x1 = static_cast<uint16_t>(box.x1);
+    r.y0 = static_cast<uint16_t>(box.y0), r.y1 = static_cast<uint16_t>(box.y1);
+    for (int a = 0; a < 2; ++a) radii[2 * (first + l) + a] = clamp_int(__builtin_ceilf(rad[a][l]), 1 << 30);
+    ids[found++] = static_cast<uint32_t>(first + l);
+  }
+  return found;
+}
+
+// Fills records and radii, and leaves ids and depth keys of the visible Gaussians, in index order, for the sort.
+inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t* radii) {
+  const int chunks = divide_up(P.count, kProjectChunk);
+  uint32_t *ids = frame.order2.as<uint32_t>(), *found = frame.chunks.as<uint32_t>();
+  parallel(pool, chunks, [&](int chunk, int) {
+    const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
+    const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
+    uint32_t n = 0;
+    for (int64_t i = begin; i < end; i += kLanes) {
+      const int lanes = end - i < kLanes ? static_cast<int>(end - i) : kLanes;
+      n += project_lanes(frame, P, i, lanes, radii, ids + begin + n);
+    }
+    found[chunk] = n;
+  });
+  int64_t total = 0;
+  uint32_t *keys = frame.keys.as<uint32_t>(), *order = frame.order.as<uint32_t>();
+  const Record* records = frame.records.as<Record>();
+  for (int chunk = 0; chunk < chunks; ++chunk) {
+    for (uint32_t k = 0; k < found[chunk]; ++k, ++total) {
+      const uint32_t id = ids[static_cast<int64_t>(chunk) * kProjectChunk + k];
+      order[total] = id;
+      std::memcpy(&keys[total], &records[id].depth, 4);  // positive floats sort like their bits
+    }
+  }
+  frame.visible = total;
+}
+
+// dLoss/d(shN row) = Y ⊗ dLoss/dcolor; returns dLoss/d(direction) before normalisation.
+inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (*Y)[kLanes], const float (*Yx)[kLanes],
+                        const float (*Yy)[kLanes], const float (*Yz)[kLanes], int lane, const float* v_color, float* v_sh,
+                        float* v_direction) {
+  const float* rest = P.shN + 3 * P.sh_rest * n;
+  const f4 v = {v_color[0], v_color[1], v_color[2], 0.f};
+  f4 dx = splat<f4>(0.f), dy = dx, dz = dx;
+  for (int k = 0; k < bands; ++k) {
+    const bool last = k == P.sh_rest - 1;
+    const f4 sh = load_rgb(rest + 3 * k, last);
+    dx += sh * Yx[k][lane], dy += sh * Yy[k][lane], dz += sh * Yz[k][lane];
+    const f4 g = v * Y[k][lane];
+    if (last) {
+      v_sh[3 * k] = g[0], v_sh[3 * k + 1] = g[1], v_sh[3 * k + 2] = g[2];
+    } else {
+      store4(v_sh + 3 * k, g);  // the fourth lane is overwritten by the next coefficient or cleared below
+    }
+  }
+  for (int k = 3 * bands; k < 3 * P.sh_rest; ++k) v_sh[k] = 0.f;
+  v_direction[0] = dx[0] * v[0] + dx[1] * v[1] + dx[2] * v[2];
+  v_direction[1] = dy[0] * v[0] + dy[1] * v[1] + dy[2] * v[2];
+  v_direction[2] = dz[0] * v[0] + dz[1] * v[1] + dz[2] * v[2];
+}
+
+// The rows of one splat, summed in slot order; null rows give zeros.
+inline void sum_rows(const Frame& frame, const Record& record, float out[kRow]) {
+  const float* row = frame.rows.as<float>() + static_cast<int64_t>(record.slot) * kRow;
+  f8 a = splat<f8>(0.f), b = a;
+  for (uint32_t k = 0; k < record.count; ++k, row += kRow) a += load8(row), b += load8(row + 8);
+  store8(out, a), store8(out + 8, b);
+}
+
+inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kLanes],
+                                   int lanes) {
+  const Camera& cam = frame.camera;
+  const Record* records = frame.records.as<Record>();
+  alignas(64) float sums[kLanes][kRow];
+  f8 field[kRow];
+  for (int l = 0; l < kLanes; ++l) sum_rows(frame, records[index[l]], sums[l]);
+  for (int h = 0; h < 2; ++h) {
+    for (int l = 0; l < 8; ++l) field[8 * h + l] = load8(sums[l] + 8 * h);
+    transpose8(field + 8 * h);
+  }
+  const Splat3D<f8> g = load_splats(P, index);
+  const Projected<f8> p = project(cam, g);
+  const f8 zero = splat<f8>(0.f), idet = splat<f8>(1.f) / p.det;
+  const f8 a = p.yy * idet, b = zero - p.xy * idet, c = p.xx * idet;
+  const SplatGradient<f8> v = {a * field[kSx] + b * field[kSy], b * field[kSx] + c * field[kSy],
+                               field[kSxx] * -0.5f,             zero - field[kSxy],
+                               field[kSyy] * -0.5f,             field[kS],
+                               field[kWz]};
+  Splat3D<f8> out = project_backward(cam, p, v);
+
+  f8 basis[15], bx[15], by[15], bz[15], inv;
+  alignas(32) float Y[15][kLanes], Yx[15][kLanes], Yy[15][kLanes], Yz[15][kLanes];
+  const Vec3<f8> d = view_directions(cam, g.mean, inv);
+  const int degree = frame.sh_degree, bands = (degree + 1) * (degree + 1) - 1;
+  sh_basis(degree, d.x, d.y, d.z, basis);
+  sh_basis_gradient(degree, d.x, d.y, d.z, bx, by, bz);
+  for (int k = 0; k < bands; ++k) store8(Y[k], basis[k]), store8(Yx[k], bx[k]), store8(Yy[k], by[k]), store8(Yz[k], bz[k]);
+  alignas(32) float vd[3][kLanes] = {};
+  for (int l = 0; l < lanes; ++l) {
+    const int64_t n = index[l];
+    const Record& r = records[n];
+    float direction[3];
+    const float color[3] = {r.r > 0.f ? sums[l][kWr] : 0.f, r.g > 0.f ? sums[l][kWg] : 0.f, r.b > 0.f ? sums[l][kWb] : 0.f};
+    for (int ch = 0; ch < 3; ++ch) G.sh0[3 * n + ch] = color[ch] * kSH0;
+    sh_backward(P, n, bands, Y, Yx, Yy, Yz, l, color, G.shN + 3 * P.sh_rest * n, direction);
+    for (int a3 = 0; a3 < 3; ++a3) vd[a3][l] = direction[a3];
+  }
+  Vec3<f8> u = {load8(vd[0]), load8(vd[1]), load8(vd[2])};
+  u = (u - d * dot(u, d)) * inv;
+  out.mean = out.mean + u;
+
+  const f8 results[15] = {out.mean.x, out.mean.y,      out.mean.z,      out.qw,          out.qx,    out.qy, out.qz, out.log_scale.x,
+                          out.log_scale.y, out.log_scale.z, out.logit, v.mx, v.my, field[kAbsX], field[kAbsY]};
+  alignas(32) float t[15][kLanes];
+  for (int k = 0; k < 15; ++k) store8(t[k], results[k]);
+  for (int l = 0; l < lanes; ++l) {
+    const int64_t n = index[l];
+    for (int k = 0; k < 3; ++k) G.means[3 * n + k] = t[k][l], G.log_scales[3 * n + k] = t[7 + k][l];
+    for (int k = 0; k < 4; ++k) G.quats[4 * n + k] = t[3 + k][l];
+    G.logit_opacities[n] = t[10][l];
+    for (int k = 0; k < 2; ++k) G.means2d[2 * n + k] = t[11 + k][l];
+    if (G.means2d_abs)
+      for (int k = 0; k < 2; ++k) G.means2d_abs[2 * n + k] = t[13 + k][l];
+  }
+}
+
+inline void zero_gradient(const Parameters& P, const ParameterGradients& G, int64_t n) {
+  for (int k = 0; k < 3; ++k) G.means[3 * n + k] = G.log_scales[3 * n + k] = G.sh0[3 * n + k] = 0.f;
+  for (int k = 0; k < 4; ++k) G.quats[4 * n + k] = 0.f;
+  G.logit_opacities[n] = 0.f;
+  G.means2d[2 * n] = G.means2d[2 * n + 1] = 0.f;
+  if (G.means2d_abs) G.means2d_abs[2 * n] = G.means2d_abs[2 * n + 1] = 0.f;
+  std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
+}
+
+// Gaussians that are in no tile get zeros; the others are packed into full vectors, in index order.
+inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P, const ParameterGradients& G) {
+  const Record* records = frame.records.as<Record>();
+  parallel(pool, divide_up(P.count, kProjectChunk), [&](int chunk, int) {
+    const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
+    const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
+    int64_t index[kLanes];
+    int lanes = 0;
+    for (int64_t n = begin; n < end; ++n) {
+      if (records[n].count == 0) {
+        zero_gradient(P, G, n);
+        continue;
+      }
+      index[lanes++] = n;
+      if (lanes == kLanes) project_backward_lanes(frame, P, G, index, lanes), lanes = 0;
+    }
+    if (lanes) {
+      for (int l = lanes; l < kLanes; ++l) index[l] = index[0];
+      project_backward_lanes(frame, P, G, index, lanes);
+    }
+  });
+}
+
+}  // namespace gsopt::GSOPT_ISA

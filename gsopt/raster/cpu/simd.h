@@ -1,0 +1,179 @@
+// Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the
+// language has no operator. 8 lanes hold Gaussians, 16 lanes hold the pixels of a 4x4 block.
+// Included once per instruction set; everything lives in that set's own namespace.
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace gsopt::GSOPT_ISA {
+
+using f4 = float __attribute__((vector_size(16)));
+using f8 = float __attribute__((vector_size(32)));
+using i8 = int32_t __attribute__((vector_size(32)));
+// Unaligned views of the same, for loads and stores.
+using f4u = float __attribute__((vector_size(16), aligned(4), may_alias));
+using f8u = float __attribute__((vector_size(32), aligned(4), may_alias));
+using i8u = int32_t __attribute__((vector_size(32), aligned(4), may_alias));
+
+constexpr int kLanes = 8;    // Gaussians per vector
+constexpr int kPixels = 16;  // pixels per block
+
+inline f4 load4(const float* p) { return *reinterpret_cast<const f4u*>(p); }
+inline void store4(float* p, f4 v) { *reinterpret_cast<f4u*>(p) = v; }
+inline f8 load8(const float* p) { return *reinterpret_cast<const f8u*>(p); }
+inline void store8(float* p, f8 v) { *reinterpret_cast<f8u*>(p) = v; }
+inline i8 load8i(const int32_t* p) { return *reinterpret_cast<const i8u*>(p); }
+inline void store8i(int32_t* p, i8 v) { *reinterpret_cast<i8u*>(p) = v; }
+
+template <class V> V splat(float x);
+template <> inline float splat<float>(float x) { return x; }
+template <> inline f4 splat<f4>(float x) { return f4{x, x, x, x}; }
+template <> inline f8 splat<f8>(float x) { return f8{x, x, x, x, x, x, x, x}; }
+inline i8 splat8i(int32_t x) { return i8{x, x, x, x, x, x, x, x}; }
+
+inline i8 bits(f8 v) { return (i8)v; }
+inline f8 from_bits(i8 v) { return (f8)v; }
+inline i8 to_int(f8 v) { return __builtin_convertvector(v, i8); }  // truncates
+inline f8 to_float(i8 v) { return __builtin_convertvector(v, f8); }
+inline f8 select(i8 m, f8 a, f8 b) { return m ? a : b; }
+inline f8 keep(i8 m, f8 a) { return (f8)(m & (i8)a); }  // a where m, else +0
+inline f8 abs(f8 a) { return (f8)((i8)a & splat8i(0x7fffffff)); }
+
+#if defined(__AVX2__)
+inline int movemask(i8 m) { return _mm256_movemask_ps((__m256)m); }
+inline f8 sqrt(f8 a) { return (f8)_mm256_sqrt_ps((__m256)a); }
+inline f8 min(f8 a, f8 b) { return (f8)_mm256_min_ps((__m256)a, (__m256)b); }
+inline f8 max(f8 a, f8 b) { return (f8)_mm256_max_ps((__m256)a, (__m256)b); }
+inline i8 shift_left(i8 a, i8 n) { return (i8)_mm256_sllv_epi32((__m256i)a, (__m256i)n); }
+#else
+inline int movemask(i8 m) {
+  int r = 0;
+  for (int k = 0; k < 8; ++k) r |= (m[k] < 0) << k;
+  return r;
+}
+inline f8 sqrt(f8 a) {
+  f8 r;
+  for (int k = 0; k < 8; ++k) r[k] = __builtin_sqrtf(a[k]);
+  return r;
+}
+inline f8 min(f8 a, f8 b) { return a < b ? a : b; }
+inline f8 max(f8 a, f8 b) { return a > b ? a : b; }
+inline i8 shift_left(i8 a, i8 n) { return a << n; }
+#endif
+
+inline bool any(i8 m) { return movemask(m) != 0; }
+inline f8 clamp(f8 x, f8 lo, f8 hi) { return min(max(x, lo), hi); }
+
+// 16 pixels: one register of AVX-512, or two of 8 lanes. Masks are integers, all ones where true.
+#if defined(__AVX512F__)
+using f16 = float __attribute__((vector_size(64)));
+using i16 = int32_t __attribute__((vector_size(64)));
+using f16u = float __attribute__((vector_size(64), aligned(4), may_alias));
+using i16u = int32_t __attribute__((vector_size(64), aligned(4), may_alias));
+template <> inline f16 splat<f16>(float x) { return f16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+inline i16 splat16i(int32_t x) { return i16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+inline f16 load16(const float* p) { return *reinterpret_cast<const f16u*>(p); }
+inline void store16(float* p, f16 v) { *reinterpret_cast<f16u*>(p) = v; }
+inline i16 load16i(const int32_t* p) { return *reinterpret_cast<const i16u*>(p); }
+inline void store16i(int32_t* p, i16 v) { *reinterpret_cast<i16u*>(p) = v; }
+inline i16 bits(f16 v) { return (i16)v; }
+inline f16 from_bits(i16 v) { return (f16)v; }
+inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
+inline i16 select(i16 m, i16 a, i16 b) { return m ? a : b; }
+inline f16 min(f16 a, f16 b) { return (f16)_mm512_min_ps((__m512)a, (__m512)b); }
+inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
+inline bool any(i16 m) { return _mm512_movepi32_mask((__m512i)m) != 0; }
+inline float sum(f16 a) { return _mm512_reduce_add_ps((__m512)a); }
+inline i16 shift_exponent(i16 n) { return n << 23; }
+#else
+struct i16 {
+  i8 lo, hi;
+};
+struct f16 {
+  f8 lo, hi;
+};
+inline f16 operator+(f16 a, f16 b) { return {a.lo + b.lo, a.hi + b.hi}; }
+inline f16 operator-(f16 a, f16 b) { return {a.lo - b.lo, a.hi - b.hi}; }
+inline f16 operator*(f16 a, f16 b) { return {a.lo * b.lo, a.hi * b.hi}; }
+inline f16 operator/(f16 a, f16 b) { return {a.lo / b.lo, a.hi / b.hi}; }
+inline i16 operator+(i16 a, i16 b) { return {a.lo + b.lo, a.hi + b.hi}; }
+inline i16 operator&(i16 a, i16 b) { return {a.lo & b.lo, a.hi & b.hi}; }
+inline i16 operator>(f16 a, f16 b) { return {a.lo > b.lo, a.hi > b.hi}; }
+inline i16 operator>=(f16 a, f16 b) { return {a.lo >= b.lo, a.hi >= b.hi}; }
+inline i16 operator<(f16 a, f16 b) { return {a.lo < b.lo, a.hi < b.hi}; }
+inline i16 operator>=(i16 a, i16 b) { return {a.lo >= b.lo, a.hi >= b.hi}; }
+template <> inline f16 splat<f16>(float x) { return {splat<f8>(x), splat<f8>(x)}; }
+inline i16 splat16i(int32_t x) { return {splat8i(x), splat8i(x)}; }
+inline f16 load16(const float* p) { return {load8(p), load8(p + 8)}; }
+inline void store16(float* p, f16 v) { store8(p, v.lo), store8(p + 8, v.hi); }
+inline i16 load16i(const int32_t* p) { return {load8i(p), load8i(p + 8)}; }
+inline void store16i(int32_t* p, i16 v) { store8i(p, v.lo), store8i(p + 8, v.hi); }
+inline i16 bits(f16 v) { return {bits(v.lo), bits(v.hi)}; }
+inline f16 from_bits(i16 v) { return {from_bits(v.lo), from_bits(v.hi)}; }
+inline f16 keep(i16 m, f16 a) { return {keep(m.lo, a.lo), keep(m.hi, a.hi)}; }
+inline i16 select(i16 m, i16 a, i16 b) { return {m.lo ? a.lo : b.lo, m.hi ? a.hi : b.hi}; }
+inline f16 min(f16 a, f16 b) { return {min(a.lo, b.lo), min(a.hi, b.hi)}; }
+inline f16 abs(f16 a) { return {abs(a.lo), abs(a.hi)}; }
+inline bool any(i16 m) { return any(m.lo | m.hi); }
+inline float sum(f16 a) {
+  f8 s = a.lo + a.hi;
+  return ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
+}
+inline i16 shift_exponent(i16 n) { return {n.lo << 23, n.hi << 23}; }
+#endif
+inline i8 shift_exponent(i8 n) { return n << 23; }
+
+// 2^x for |x| < 126, relative error 1.5e-7: minimax polynomial of degree 5 on [-1/2, 1/2] (Remez, relative weight)
+// times a power of two put together from its bits. Outside that range the result is arbitrary but harmless: mask it.
+template <class V> inline V exp2(V x) {
+  const V magic = splat<V>(12582912.f);  // 1.5 * 2^23: adding it leaves round(x) in the low bits of the mantissa
+  const V shifted = x + magic;
+  const V f = x - (shifted - magic);
+  V p = splat<V>(1.32764719920e-03f);
+  p = p * f + splat<V>(9.67554133450e-03f);
+  p = p * f + splat<V>(5.55071327350e-02f);
+  p = p * f + splat<V>(2.40221221290e-01f);
+  p = p * f + splat<V>(6.93146967060e-01f);
+  p = p * f + splat<V>(1.0000000717e+00f);
+  return from_bits(bits(p) + shift_exponent(bits(shifted)));
+}
+
+inline f8 exp(f8 x) { return exp2(clamp(x * splat<f8>(1.44269504089f), splat<f8>(-125.f), splat<f8>(125.f))); }
+
+// log2(x) for normal x > 0: x = 2^k m with m in [sqrt(1/2), sqrt(2)), then the series of atanh((m-1)/(m+1)).
+inline f8 log2(f8 x) {
+  const i8 k = (bits(x) - splat8i(0x3f3504f3)) >> 23;
+  const f8 m = from_bits(bits(x) - (k << 23));
+  const f8 one = splat<f8>(1.f), s = (m - one) / (m + one), s2 = s * s;
+  f8 p = splat<f8>(1.f / 9);
+  p = p * s2 + splat<f8>(1.f / 7);
+  p = p * s2 + splat<f8>(1.f / 5);
+  p = p * s2 + splat<f8>(1.f / 3);
+  p = p * s2 + one;
+  return to_float(k) + p * s * splat<f8>(2.88539008178f);
+}
+
+// Rows become columns: r[i][j] -> r[j][i].
+inline void transpose8(f8 r[8]) {
+  f8 a[8], b[8];
+  for (int i = 0; i < 8; i += 2) {
+    a[i] = __builtin_shufflevector(r[i], r[i + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+    a[i + 1] = __builtin_shufflevector(r[i], r[i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+  }
+  for (int i = 0; i < 8; i += 4) {
+    for (int h = 0; h < 2; ++h) {
+      b[i + 2 * h] = __builtin_shufflevector(a[i + h], a[i + h + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+      b[i + 2 * h + 1] = __builtin_shufflevector(a[i + h], a[i + h + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+    }
+  }
+  for (int i = 0; i < 4; ++i) {
+    r[i] = __builtin_shufflevector(b[i], b[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+    r[i + 4] = __builtin_shufflevector(b[i], b[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+  }
+}
+
+}  // namespace gsopt::GSOPT_ISA

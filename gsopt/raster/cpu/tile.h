@@ -1,0 +1,95 @@
+// What forward and backward share inside one tile: splats in tile coordinates, and which 4x4 blocks each one touches.
+// Coordinates are relative to the tile's centre, so the numbers stay small wherever the tile lies in the image.
+#pragma once
+#include "frame.h"
+#include "simd.h"
+
+namespace gsopt::GSOPT_ISA {
+
+// exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
+struct Local {
+  alignas(64) float A[kChunk], B[kChunk], C[kChunk], u0[kChunk], v0[kChunk], log2_opacity[kChunk];
+  alignas(64) float r[kChunk], g[kChunk], b[kChunk], depth[kChunk], dx[kChunk], dy[kChunk];
+};
+
+struct TileGeometry {
+  float x, y;  // its centre, px
+};
+inline TileGeometry tile_geometry(const Frame& frame, int tile) {
+  return {static_cast<float>(tile % frame.tiles_x * kTile + kTile / 2),
+          static_cast<float>(tile / frame.tiles_x * kTile + kTile / 2)};
+}
+
+// Per lane the 16 bits of the blocks that the ellipse alpha >= 1/255 touches: bit 4 row + column. Over a strip of four
+// pixel rows the ellipse's right end lies at the strip's y nearest to that of its rightmost point; left mirrors it.
+inline i8 block_masks(f8 A, f8 B, f8 C, f8 lo, f8 dx, f8 dy) {
+  const f8 zero = splat<f8>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f;
+  const f8 iA = splat<f8>(1.f) / A, slope = B * iA;
+  const f8 extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
+  i8 mask = splat8i(0);
+  for (int row = 0; row < 4; ++row) {
+    const f8 top = splat<f8>(4.f * row - 7.5f) - dy, bottom = top + 3.f;
+    const f8 yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
+    const f8 cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
+    const f8 margin = abs(slope * yr) * 2e-6f + abs(dx) * 2e-6f + 0.02f;
+    const f8 right = dx - slope * yr + sqrt(max(sr, zero)) * iA + margin;
+    const f8 left = dx - slope * yl - sqrt(max(sl, zero)) * iA - margin;
+    // Column k holds the centres 4 k - 7.5 ... 4 k - 4.5: columns [first, behind) are touched.
+    const i8 behind = to_int(clamp((right + 11.5f) * 0.25f, zero, splat<f8>(4.5f)));
+    const i8 first = splat8i(4) - to_int(clamp(splat<f8>(4.f) - (left + 4.5f) * 0.25f, zero, splat<f8>(4.5f)));
+    const i8 one = splat8i(1);
+    const i8 columns = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one);
+    mask |= (columns & ((sr >= 0.f) | (sl >= 0.f))) << (4 * row);
+  }
+  return mask & (t > 0.f);
+}
+
+constexpr float kNowhere = -1e30f;  // log2_opacity of the padding
+
+// Loads entries [0, n) of a chunk; pads to a multiple of eight. With `words`, also the block masks: bit k of
+// words[w][block] says whether splat 64 w + k touches the block.
+inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeometry tile, Local& local, uint64_t (*words)[kBlocks]) {
+  static const Record nowhere = {0.f, 0.f, 1.f, 0.f, 1.f, kNowhere, 0.f, 0.f, 0.f, 1.f, 0, 0, 0, 0, 0, 0, {0, 0}};
+  const Record* records = frame.records.as<Record>();
+  if (words) std::memset(words, 0, sizeof(uint64_t) * kBlocks * ((n + 63) / 64));
+  for (int i = 0; i < n; i += kLanes) {
+    f8 v[8];
+    for (int l = 0; l < kLanes; ++l) {
+      const Record& r = i + l < n ? records[entries[i + l].id] : nowhere;
+      v[l] = load8(&r.mx);
+      local.b[i + l] = r.b, local.depth[i + l] = r.depth;
+    }
+    transpose8(v);
+    const f8 dx = v[0] - tile.x, dy = v[1] - tile.y, A = v[2], B = v[3], C = v[4], lo = v[5];
+    store8(local.A + i, A), store8(local.B + i, B), store8(local.C + i, C);
+    store8(local.dx + i, dx), store8(local.dy + i, dy);
+    store8(local.u0 + i, splat<f8>(0.f) - (A * dx + B * dy)), store8(local.v0 + i, splat<f8>(0.f) - C * dy);
+    store8(local.log2_opacity + i, lo), store8(local.r + i, v[6]), store8(local.g + i, v[7]);
+    if (!words) continue;
+    const i8 mask = block_masks(A, B, C, lo, dx, dy);
+    uint64_t* word = words[i / 64];
+    const int position = i & 63;
+    for (int block = 0; block < kBlocks; ++block)
+      word[block] |= static_cast<uint64_t>(static_cast<uint32_t>(movemask(mask << (31 - block)))) << position;
+  }
+}
+
+// The pixel coordinates of a block's 16 lanes: four rows of four.
+inline void block_pixels(int block, f16& X, f16& Y) {
+  alignas(64) float x[kPixels], y[kPixels];
+  for (int k = 0; k < kPixels; ++k) {
+    x[k] = static_cast<float>(4 * (block % 4) + k % 4) - 7.5f;
+    y[k] = static_cast<float>(4 * (block / 4) + k / 4) - 7.5f;
+  }
+  X = load16(x), Y = load16(y);
+}
+
+// Calls visit(pixel of the image, lane) for the lanes of a block that lie inside the image.
+template <class Visit> inline void for_each_pixel(const Frame& frame, int tile, int block, Visit&& visit) {
+  const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4), y0 = tile / frame.tiles_x * kTile + 4 * (block / 4);
+  const int w = frame.camera.width, h = frame.camera.height;
+  for (int y = 0; y < 4 && y0 + y < h; ++y)
+    for (int x = 0; x < 4 && x0 + x < w; ++x) visit(static_cast<int64_t>(y0 + y) * w + x0 + x, 4 * y + x);
+}
+
+}  // namespace gsopt::GSOPT_ISA

@@ -1,0 +1,149 @@
+"""The CPU backend: C++ kernels behind the Backend protocol. Float32 only; the same bits for any number of threads."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.cameras import Cameras
+from gsopt.errors import UsageError
+from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.raster import _cpu  # type: ignore[attr-defined]
+from gsopt.raster.backend import Frame, Gradients, Photometric, RasterSettings
+
+ISA_VARIABLE = "GSOPT_ISA"
+
+
+@dataclass(frozen=True)
+class _Context:
+    frame: Any
+    model: Any
+    gaussians: Gaussians
+
+
+class CpuBackend:
+    """`threads` = 0 takes one per core. The environment variable GSOPT_ISA (avx512, avx2, portable) overrides the choice of
+    instruction set; one that this processor lacks raises UsageError."""
+
+    name = "cpu"
+
+    def __init__(self, threads: int = 0) -> None:
+        try:
+            self._workspace = _cpu.Workspace(threads or _available_cores(), os.environ.get(ISA_VARIABLE, ""))
+        except ValueError as error:
+            raise UsageError(f"{ISA_VARIABLE}: {error}.") from error
+        self._idle: list[Any] = []  # frames whose buffers can be used again
+
+    @property
+    def isa(self) -> str:
+        """Instruction set in use."""
+        return self._workspace.isa
+
+    @property
+    def threads(self) -> int:
+        return self._workspace.threads
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        camera: Cameras,
+        settings: RasterSettings,
+        background: Float[Tensor, "3"] | None = None,
+        *,
+        depth: bool = False,
+    ) -> Frame:
+        """See `Backend.forward`."""
+        height, width, n = camera.height, camera.width, len(gaussians)
+        gaussians = _as_float32(gaussians)
+        model = _cpu.Model(*(getattr(gaussians, name) for name in PARAMETERS))
+        view = _cpu.Camera(
+            camera.viewmats[0].double().flatten().tolist(),
+            camera.Ks[0].double().flatten().tolist(),
+            width,
+            height,
+            settings.near_plane,
+            settings.far_plane,
+            settings.eps2d,
+            settings.antialiased,
+        )
+        frame = self._idle.pop() if self._idle else _cpu.Frame()
+        colors, alphas = torch.empty(height, width, 3), torch.empty(height, width)
+        depths = torch.empty(height, width) if depth else None
+        radii = torch.empty(n, 2, dtype=torch.int32)
+        behind = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
+        degree = min(settings.sh_degree, gaussians.sh_degree)
+        _cpu.forward(self._workspace, frame, model, degree, view, behind, colors, alphas, depths, radii)
+        return Frame(colors, alphas, depths, radii, _Context(frame, model, gaussians))
+
+    def backward(
+        self,
+        frame: Frame,
+        v_colors: Float[Tensor, "H W 3"],
+        v_alphas: Float[Tensor, "H W"] | None = None,
+        v_depths: Float[Tensor, "H W"] | None = None,
+        *,
+        absgrad: bool = False,
+    ) -> Gradients:
+        """See `Backend.backward`. The frame's buffers are used again by a later `forward`."""
+        context = frame.context
+        assert isinstance(context, _Context)
+        n = len(context.gaussians)
+        gradients = {name: torch.empty_like(tensor) for name, tensor in context.gaussians.items()}
+        means2d, means2d_abs = torch.empty(n, 2), torch.empty(n, 2) if absgrad else None
+        out = _cpu.Gradient(*gradients.values(), means2d, means2d_abs)
+        alphas, depths = _contiguous(v_alphas), _contiguous(v_depths)
+        _cpu.backward(self._workspace, context.frame, context.model, v_colors.contiguous(), alphas, depths, out)
+        self._idle.append(context.frame)
+        return Gradients(**gradients, means2d=means2d, means2d_abs=means2d_abs)
+
+    def release(self, frame: Frame) -> None:
+        """Give a frame's buffers back when no `backward` will follow."""
+        assert isinstance(frame.context, _Context)
+        self._idle.append(frame.context.frame)
+
+    def photometric(
+        self, rendered: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], lambda_dssim: float
+    ) -> Photometric:
+        """See `Backend.photometric`."""
+        height, width = rendered.shape[:2]
+        v_colors = torch.empty(height, width, 3)
+        l1, ssim = _cpu.photometric(
+            self._workspace, rendered.contiguous(), target.contiguous(), v_colors, height, width, lambda_dssim
+        )
+        return Photometric(l1, ssim, (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim), v_colors)
+
+    def adam(
+        self,
+        param: Tensor,
+        grad: Tensor,
+        exp_avg: Tensor,
+        exp_avg_sq: Tensor,
+        *,
+        lr: float,
+        beta1: float,
+        beta2: float,
+        eps: float,
+        step: int,
+    ) -> None:
+        """See `Backend.adam`."""
+        active = param[0].numel() if len(param) else 0
+        _cpu.adam(
+            self._workspace, param, grad, exp_avg, exp_avg_sq, len(param), active, lr, beta1, beta2, eps, step
+        )
+
+
+def _as_float32(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(**{name: tensor.detach().float().contiguous() for name, tensor in gaussians.items()})
+
+
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.float().contiguous()
+
+
+def _available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
