@@ -1,9 +1,11 @@
-"""Every setting of a run: frozen dataclasses with units in the docstrings, checked when made, to and from JSON. No torch here."""
+"""Every setting of a run: frozen dataclasses, units in docstrings, checked when made, to and from JSON. No torch."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
 import types
 import typing
 from dataclasses import dataclass, field
@@ -14,6 +16,13 @@ from gsopt import check
 from gsopt.errors import InputError, UsageError
 
 T = TypeVar("T")
+
+MOST = 1e9
+"""Upper bound of weights and rates: keeps infinities and typing errors out."""
+LARGEST_CONFIG = 1 << 20
+"""Bytes of config.json that are read."""
+MOST_GAUSSIANS = 100_000_000
+"""More than any machine this runs on can hold."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +48,12 @@ class DataConfig:
         check.at_least("--resolution", self.downscale, 1, "1 keeps the size, 2 halves it, and so on.")
         if self.views is not None:
             check.at_least("--views", self.views, 1, "Drop the flag to use all input views.")
+        if self.view_ids is not None and (not self.view_ids or min(self.view_ids) < 0):
+            raise UsageError(f"`--view-ids` must be numbers from 0 up, got {list(self.view_ids)}. Try 2,16,26.")
         if self.views is not None and self.view_ids is not None:
             raise UsageError("`--views` and `--view-ids` were both given. Keep one of them.")
         check.one_of("--background", self.background, ("white", "black", "random"))
+        check.at_least("--cache-mb", self.cache_mb, 0, "0 decodes every image again each time; the default is 2048.")
 
 
 @dataclass(frozen=True)
@@ -49,9 +61,13 @@ class InitConfig:
     """The first Gaussians."""
 
     method: Literal["auto", "points", "hull", "random"] = "auto"
-    """auto: SfM points when there are enough, else the visual hull when there is alpha, else random in the common frustum."""
+    """auto: SfM points when there are enough, else the visual hull when there is alpha, else random in the frustum."""
     count: int = 20_000
     """How many to make (hull and random)."""
+
+    def __post_init__(self) -> None:
+        check.one_of("--init", self.method, ("auto", "points", "hull", "random"))
+        check.within("--init-count", self.count, 1, MOST_GAUSSIANS, "The default is 20000.")
 
 
 @dataclass(frozen=True)
@@ -61,18 +77,37 @@ class OptimizerConfig:
     lr_means: float = 1.6e-4
     """Times the scene extent; decays log-linearly to `lr_means_final` over the run."""
     lr_means_final: float = 1.6e-6
+    """Times the scene extent; reached at the last step."""
     lr_quats: float = 1e-3
+    """Of the rotations."""
     lr_log_scales: float = 5e-3
+    """Of the logarithms of the scales."""
     lr_logit_opacities: float = 5e-2
+    """Of the opacities before the sigmoid."""
     lr_sh0: float = 2.5e-3
+    """Of the base colour."""
     lr_shN: float = 1.25e-4
+    """Of the view-dependent colour."""
     beta1: float = 0.9
+    """Decay of Adam's mean gradient."""
     beta2: float = 0.999
+    """Decay of Adam's mean squared gradient."""
     eps: float = 1e-15
+    """Added to the root of the mean squared gradient."""
     sh_degree: int = 3
     """Highest band of the spherical harmonics."""
     sh_degree_every: int = 1000
     """Steps between two bands."""
+
+    def __post_init__(self) -> None:
+        for name in ("means", "means_final", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+            value = getattr(self, f"lr_{name}")
+            check.within(f"--optimizer.lr-{name}".replace("_", "-"), value, 0.0, MOST, "Drop the flag for the default.")
+        check.within("--optimizer.beta1", self.beta1, 0.0, 0.999999, "The default is 0.9.")
+        check.within("--optimizer.beta2", self.beta2, 0.0, 0.999999, "The default is 0.999.")
+        check.within("--optimizer.eps", self.eps, 1e-38, 1.0, "The default is 1e-15.")
+        check.within("--optimizer.sh-degree", self.sh_degree, 0, 3, "Bands 0 to 3 are supported.")
+        check.at_least("--optimizer.sh-degree-every", self.sh_degree_every, 1, "The default is 1000.")
 
 
 @dataclass(frozen=True)
@@ -83,10 +118,16 @@ class LossConfig:
     """Weight of 1 - SSIM against L1."""
     lambda_alpha: float = 0.0
     """Weight of the L1 between rendered alpha and the image's alpha or mask."""
-    lambda_opacity: float = 0.0
-    """Weight of the mean opacity (Kheradmand et al. 2024)."""
-    lambda_scale: float = 0.0
-    """Weight of the mean scale, scene units (Kheradmand et al. 2024)."""
+    lambda_opacity: float | None = None
+    """Weight of the mean opacity (Kheradmand et al. 2024); 0.01 with mcmc, 0 with adc when not given."""
+    lambda_scale: float | None = None
+    """Weight of the mean scale, scene units (Kheradmand et al. 2024); 0.01 with mcmc, 0 with adc when not given."""
+
+    def __post_init__(self) -> None:
+        check.within("--loss.lambda-dssim", self.lambda_dssim, 0.0, 1.0, "The default is 0.2.")
+        check.within("--loss.lambda-alpha", self.lambda_alpha, 0.0, MOST, "The default is 0.")
+        check.within("--loss.lambda-opacity", self.lambda_opacity or 0.0, 0.0, MOST, "Drop it for the default.")
+        check.within("--loss.lambda-scale", self.lambda_scale or 0.0, 0.0, MOST, "Drop it for the default.")
 
 
 @dataclass(frozen=True)
@@ -94,13 +135,15 @@ class DensityConfig:
     """How many Gaussians there are, and where."""
 
     strategy: Literal["adc", "mcmc"] = "adc"
-    """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate and grow to the budget (Kheradmand et al. 2024)."""
+    """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
     max_gaussians: int = 1_000_000
     """Never more than this."""
     refine_start: int = 500
-    refine_stop: int = 15_000
-    """Steps between which Gaussians are added and removed; never past half of `iterations` for adc's growth."""
+    """First step after which Gaussians are added and removed."""
+    refine_stop: int | None = None
+    """Last such step; when not given, min(15000, 60 % of iterations) for adc, min(25000, 83 %) for mcmc."""
     refine_every: int = 100
+    """Steps between two refinements."""
     grow_grad2d: float = 2e-4
     """adc: grow where the mean gradient of the projected centre exceeds this (normalised device coordinates)."""
     absgrad: bool = False
@@ -108,14 +151,29 @@ class DensityConfig:
     grow_scale3d: float = 0.01
     """adc: split above, clone below this scale (fraction of the scene extent)."""
     prune_opacity: float = 0.005
+    """adc: remove less opaque ones; mcmc: move less opaque ones to where there is something to draw."""
     prune_scale3d: float = 0.1
     """adc: remove larger ones after the first opacity reset (fraction of the scene extent)."""
     reset_every: int = 3000
-    """adc: steps between two opacity resets."""
+    """adc: steps between two opacity resets, none in the last 2000 steps; 0 = never."""
     noise_lr: float = 5e5
     """mcmc: strength of the position noise."""
     growth: float = 1.05
     """mcmc: growth per refinement, until the budget."""
+
+    def __post_init__(self) -> None:
+        check.one_of("--strategy", self.strategy, ("adc", "mcmc"))
+        check.within("--max-gaussians", self.max_gaussians, 1, MOST_GAUSSIANS, "The default is 1000000.")
+        check.at_least("--density.refine-start", self.refine_start, 0, "The default is 500.")
+        check.at_least("--density.refine-stop", self.refine_stop or 0, 0, "Drop the flag for the default.")
+        check.at_least("--density.refine-every", self.refine_every, 1, "The default is 100.")
+        check.within("--density.grow-grad2d", self.grow_grad2d, 0.0, MOST, "The default is 0.0002.")
+        check.within("--density.grow-scale3d", self.grow_scale3d, 0.0, MOST, "The default is 0.01.")
+        check.within("--density.prune-opacity", self.prune_opacity, 1e-6, 0.49, "The default is 0.005.")
+        check.within("--density.prune-scale3d", self.prune_scale3d, 0.0, MOST, "The default is 0.1.")
+        check.at_least("--density.reset-every", self.reset_every, 0, "0 never resets; the default is 3000.")
+        check.within("--density.noise-lr", self.noise_lr, 0.0, MOST, "The default is 500000.")
+        check.within("--density.growth", self.growth, 1.0, MOST, "The default is 1.05.")
 
 
 @dataclass(frozen=True)
@@ -125,15 +183,26 @@ class SparseConfig:
     below_views: int = 16
     """Number of input views from which on down they are active; 0 turns them off."""
     dropout: float = 0.2
-    """Share of Gaussians left out of a step at the end of the run, rising linearly from 0 (DropGaussian, Park et al. 2025)."""
+    """Share of Gaussians left out of the last step, rising linearly from 0 (DropGaussian, Park et al. 2025)."""
     floater_every: int = 500
     """Steps between two prunings by nearest-neighbour distance (GaussianObject, Yang et al. 2024); 0 = never."""
     lambda_opacity: float = 0.01
+    """Replaces that of LossConfig where this is larger."""
     lambda_scale: float = 0.01
+    """Replaces that of LossConfig where this is larger."""
     lambda_alpha: float = 0.1
-    """Replace those of LossConfig where these are larger."""
+    """Replaces that of LossConfig where this is larger."""
     sh_degree: int = 2
     """Upper bound on the bands."""
+
+    def __post_init__(self) -> None:
+        check.at_least("--sparse.below-views", self.below_views, 0, "0 turns these regularisers off.")
+        check.within("--sparse.dropout", self.dropout, 0.0, 0.95, "0 leaves none out; the default is 0.2.")
+        check.at_least("--sparse.floater-every", self.floater_every, 0, "0 never prunes; the default is 500.")
+        check.within("--sparse.lambda-opacity", self.lambda_opacity, 0.0, MOST, "The default is 0.01.")
+        check.within("--sparse.lambda-scale", self.lambda_scale, 0.0, MOST, "The default is 0.01.")
+        check.within("--sparse.lambda-alpha", self.lambda_alpha, 0.0, MOST, "The default is 0.1.")
+        check.within("--sparse.sh-degree", self.sh_degree, 0, 3, "Bands 0 to 3 are supported.")
 
 
 @dataclass(frozen=True)
@@ -143,7 +212,15 @@ class ScheduleConfig:
     coarse_until: tuple[int, ...] = ()
     """Steps at which the resolution doubles, e.g. (500, 1500): quarter, half, full."""
     stop_when_flat: bool = False
-    """Stop early when the loss over the input views no longer falls."""
+    """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
+
+    def __post_init__(self) -> None:
+        steps = (0, *self.coarse_until)
+        if any(later <= earlier for earlier, later in itertools.pairwise(steps)):
+            raise UsageError(
+                f"`--schedule.coarse-until` must be rising steps above 0, got {list(self.coarse_until)}. Try 500 1500."
+            )
+        check.within("number of --schedule.coarse-until", len(self.coarse_until), 0, 6, "Each one halves the image.")
 
 
 @dataclass(frozen=True)
@@ -172,7 +249,10 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check.at_least("--iterations", self.iterations, 1, "Drop the flag for the default of 7000.")
         check.at_least("--threads", self.threads, 0, "0 takes one thread per core.")
-        check.at_least("--seed", self.seed, 0, "Give a whole number.")
+        check.within("--seed", self.seed, 0, 2**31 - 1, "Give a whole number in that range.")
+        check.one_of("--backend", self.backend, ("auto", "cpu", "reference"))
+        check.at_least("--checkpoint-every", self.checkpoint_every, 0, "0 writes only the last one.")
+        check.at_least("--preview-every", self.preview_every, 0, "0 writes none.")
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; `from_dict` is its inverse."""
@@ -187,9 +267,12 @@ class TrainConfig:
     def read(path: Path) -> TrainConfig:
         """The `config` of a run's config.json."""
         try:
-            document = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise InputError(f"Cannot read the configuration {path}: {error}. Give the folder of a gsopt run.") from error
+            with open(path, "rb") as file:
+                document = json.loads(file.read(LARGEST_CONFIG))
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(
+                f"Cannot read the configuration {path}: {error}. Give the folder of a gsopt run."
+            ) from error
         if not isinstance(document, dict) or not isinstance(document.get("config"), dict):
             raise InputError(f"{path} has no object `config`. Give the config.json that `gsopt train` wrote.")
         return TrainConfig.from_dict(document["config"])
@@ -223,7 +306,7 @@ def _matches(hint: Any, value: Any) -> bool:
     if origin is tuple:
         return isinstance(value, (list, tuple)) and all(_matches(args[0], item) for item in value)
     if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool)
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     return value is None if hint is type(None) else isinstance(value, hint)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 
 VERSION = 1
 LAST = ("done", "stopped", "error")
@@ -31,7 +31,9 @@ def write_atomic(path: Path, data: bytes) -> None:
         os.replace(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise InputError(f"Cannot write {path}: {error.strerror or error}. Free some space or choose another folder.") from error
+        raise InputError(
+            f"Cannot write {path}: {error.strerror or error}. Free some space or choose another folder."
+        ) from error
 
 
 def to_json(value: Any) -> bytes:
@@ -40,28 +42,49 @@ def to_json(value: Any) -> bytes:
 
 
 class EventWriter:
-    """Appends events to `events.jsonl`; continues the numbering of an earlier run in the same folder."""
+    """Appends events to `events.jsonl`; continues the numbering of an earlier run in the same folder.
+
+    Holds an advisory lock on the file while open, which a killed process gives back by dying.
+    """
 
     def __init__(self, run: Path) -> None:
         self.path = run / "events.jsonl"
-        previous, _ = read_events(self.path)
+        previous, end = read_events(self.path)
         self._seq = previous[-1]["seq"] + 1 if previous else 0
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        if self.path.stat().st_size and not self.path.read_bytes().endswith(b"\n"):
+        try:
+            self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        except OSError as error:
+            raise InputError(f"Cannot write {self.path}: {error.strerror}. Choose another folder.") from error
+        _lock(self._fd, self.path)
+        if os.fstat(self._fd).st_size > end:
             os.write(self._fd, b"\n")  # a killed writer left half a line: close it off, readers skip it
 
-    def emit(self, kind: str, **fields: Any) -> None:
-        """One line, one write."""
+    def emit(self, kind: str, **fields: Any) -> dict[str, Any]:
+        """One line, one write; returns the event."""
         event = {"v": VERSION, "seq": self._seq, "kind": kind, "time": round(time.time(), 3), **fields}
         os.write(self._fd, (json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n").encode())
         self._seq += 1
+        return event
 
     def close(self) -> None:
         os.close(self._fd)
 
 
+def _lock(descriptor: int, path: Path) -> None:
+    """One writer per run: UsageError where another process holds the file. Not available on Windows."""
+    try:
+        import fcntl
+    except ImportError:
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        raise UsageError(f"Another process is writing {path}. Wait for it, or choose another folder.") from error
+
+
 def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
-    """Events after byte `offset` and the offset to go on from; broken lines are skipped, a higher version is refused."""
+    """Events after byte `offset` and the offset to go on from; broken lines are skipped, a higher version refused."""
     if not path.exists():
         return [], offset
     with open(path, "rb") as file:
@@ -77,6 +100,8 @@ def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]
         if not isinstance(event, Mapping) or not isinstance(event.get("seq"), int):
             continue
         if event.get("v") != VERSION:
-            raise InputError(f"{path} speaks protocol version {event.get('v')}, this gsopt reads {VERSION}. Update gsopt.")
+            raise InputError(
+                f"{path} speaks protocol version {event.get('v')}, this gsopt reads {VERSION}. Update gsopt."
+            )
         events.append(dict(event))
     return events, offset + end

@@ -1,0 +1,1 @@
+"""How Gaussians are changed until they look like the input views; `loop.train` is the way in."""

@@ -1,0 +1,62 @@
+"""How many Gaussians there are and where: one protocol, two published strategies."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gsopt.config import TrainConfig
+from gsopt.raster.backend import Gradients
+from gsopt.training.optimizer import Model
+
+
+class DensityControl(Protocol):
+    """Watches every step and now and then changes the set of Gaussians."""
+
+    def after_backward(
+        self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
+    ) -> None:
+        """Note what one view's backward pass says; image size in px."""
+        ...
+
+    def after_step(self, model: Model, lr_means: float) -> None:
+        """Change parameters in place after the optimiser step; `lr_means` in scene units."""
+        ...
+
+    def refine(self, step: int, model: Model) -> Model:
+        """Add and remove Gaussians when this step asks for it; the very same record where rows stay the same."""
+        ...
+
+    def select(self, rows: Tensor) -> None:
+        """Follow a selection or permutation of the Gaussians."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The statistics, for a checkpoint."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take the statistics back."""
+        ...
+
+
+def make_density(config: TrainConfig, extent: float, count: int, generator: torch.Generator) -> DensityControl:
+    """The configured strategy for `count` first Gaussians; `extent` of the scene in scene units."""
+    if config.density.strategy == "mcmc":
+        from gsopt.training.density.mcmc import Mcmc
+
+        return Mcmc(config.density, config.iterations, generator)
+    from gsopt.training.density.adc import Adc
+
+    return Adc(config.density, config.iterations, extent, count, generator)
+
+
+def at_least_one(keep: Bool[Tensor, "N"], scores: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
+    """`keep`, or only the row of the highest score where nothing would be left: an empty scene learns nothing more."""
+    if len(keep) and not bool(keep.any()):
+        keep = keep.clone()
+        keep[scores.argmax()] = True
+    return keep

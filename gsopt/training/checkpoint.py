@@ -1,0 +1,87 @@
+"""Checkpoints: one safetensors file per saved step, written whole or not at all, read back bit for bit."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gsopt.errors import InputError
+
+VERSION = 1
+KEEP = 2
+"""How many of the newest are kept: the last may have met a full disk or a power cut."""
+NAME = re.compile(r"step_(\d+)\.safetensors")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a run needs to go on as if it had never stopped."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    meta: dict[str, Any]
+
+
+def save_checkpoint(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Path:
+    """Write `step_NNNNNN.safetensors` atomically and remove all but the newest two."""
+    path = folder / f"step_{step:06d}.safetensors"
+    temporary = folder / f".{path.name}.{os.getpid()}.tmp"
+    header = {"gsopt": json.dumps({"version": VERSION, **meta}, allow_nan=False, sort_keys=True)}
+    try:
+        folder.mkdir(exist_ok=True)
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, temporary, metadata=header)
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"Cannot write the checkpoint {path}: {error}. Free some space, then use --resume.") from error
+    for old in saved(folder)[KEEP:]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def saved(folder: Path) -> list[Path]:
+    """The checkpoints in a folder, newest step first."""
+    found = [
+        (int(match[1]), path) for path in folder.glob("step_*.safetensors") if (match := NAME.fullmatch(path.name))
+    ]
+    return [path for _, path in sorted(found, reverse=True)]
+
+
+def load_newest(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+    """The newest checkpoint that can be read, None where there is none; every broken one is told to `warn`."""
+    for path in saved(folder):
+        try:
+            return read_checkpoint(path)
+        except InputError as error:
+            warn(str(error))
+    return None
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """One checkpoint, or InputError saying why it cannot be used."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {})["gsopt"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        if meta["version"] != VERSION:
+            raise ValueError(f"version {meta['version']} instead of {VERSION}")
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"The checkpoint {path} cannot be read ({error}). The one before it is used.") from error
+    return Checkpoint(path, tensors, meta)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what a killed writer left half done."""
+    for leftover in folder.glob(".step_*.tmp"):
+        leftover.unlink(missing_ok=True)

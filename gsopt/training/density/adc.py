@@ -1,0 +1,120 @@
+"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split, prune and reset, within a budget."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gsopt import quats as quaternions
+from gsopt.config import DensityConfig
+from gsopt.gaussians import Gaussians
+from gsopt.raster.backend import Gradients
+from gsopt.training import schedule
+from gsopt.training.density import at_least_one
+from gsopt.training.optimizer import Model
+
+# A split Gaussian becomes two whose scales are divided by this (Kerbl et al. 2023, section 5.2).
+SPLIT_SHRINK = 1.6
+
+
+class Adc:
+    """Grows where the image pulls hard on a projected centre, prunes what is transparent or too large."""
+
+    def __init__(
+        self, config: DensityConfig, iterations: int, extent: float, count: int, generator: torch.Generator
+    ) -> None:
+        self._config = config
+        self._iterations = iterations
+        self._extent = extent
+        self._generator = generator
+        self._stop = schedule.refine_stop(config, iterations)
+        self._forget(count)
+
+    def _forget(self, count: int) -> None:
+        self.grad_sum = torch.zeros(count)
+        """Sum over views of |dLoss/dmean2d| in normalised device coordinates."""
+        self.seen = torch.zeros(count, dtype=torch.int32)
+        """In how many views the Gaussian was drawn."""
+
+    def after_backward(
+        self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
+    ) -> None:
+        """Accumulate the gradient of the projected centres. Rows that were not drawn have none and are not counted."""
+        if step > self._stop:
+            return
+        v = gradients.means2d_abs if gradients.means2d_abs is not None else gradients.means2d
+        self.grad_sum += torch.hypot(v[:, 0] * (0.5 * width), v[:, 1] * (0.5 * height))
+        self.seen += radii[:, 0] > 0
+
+    def after_step(self, model: Model, lr_means: float) -> None:
+        """Nothing to do between refinements."""
+
+    def refine(self, step: int, model: Model) -> Model:
+        """Grow, prune and start the statistics afresh; lower all opacities when a reset is due."""
+        if schedule.refines(step, self._config, self._iterations):
+            model = self._prune(step, self._grow(model))
+            self._forget(len(model))
+        if schedule.resets(step, self._config, self._iterations):
+            lower_opacities(model, 2 * self._config.prune_opacity)
+        return model
+
+    def select(self, rows: Tensor) -> None:
+        self.grad_sum, self.seen = self.grad_sum[rows], self.seen[rows]
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {"grad_sum": self.grad_sum, "seen": self.seen}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        self.grad_sum, self.seen = tensors["grad_sum"], tensors["seen"]
+
+    def _grow(self, model: Model) -> Model:
+        """Clone small Gaussians and split large ones where the mean gradient is above the threshold."""
+        scores = self.grad_sum / self.seen.clamp_min(1)
+        room = max(0, self._config.max_gaussians - len(model))
+        growing = best(scores > self._config.grow_grad2d, scores, room)
+        large = largest_scales(model.gaussians) > self._config.grow_scale3d * self._extent
+        clones = model.gaussians.select(growing & ~large)
+        halves = split(model.gaussians.select(growing & large), self._generator)
+        return model.select(~(growing & large)).append(clones).append(halves)
+
+    def _prune(self, step: int, model: Model) -> Model:
+        """Remove the transparent and, once opacities were reset, the huge."""
+        opacities = model.gaussians.opacities
+        keep = opacities >= self._config.prune_opacity
+        if 0 < self._config.reset_every < step:
+            keep &= largest_scales(model.gaussians) <= self._config.prune_scale3d * self._extent
+        return model.select(at_least_one(keep, opacities))
+
+
+def best(chosen: Bool[Tensor, "N"], scores: Float[Tensor, "N"], room: int) -> Bool[Tensor, "N"]:
+    """`chosen`, cut down to the `room` highest scores where it is more; equal scores in row order."""
+    if int(chosen.sum()) <= room:
+        return chosen
+    ranked = torch.argsort(torch.where(chosen, scores, -1.0), descending=True, stable=True)
+    kept = torch.zeros_like(chosen)
+    kept[ranked[:room]] = True
+    return kept
+
+
+def largest_scales(gaussians: Gaussians) -> Float[Tensor, "N"]:
+    """Standard deviation along the longest axis, scene units."""
+    return gaussians.log_scales.amax(dim=1).exp()
+
+
+def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
+    """Two smaller Gaussians for each one, their centres drawn from it."""
+    twice = gaussians.append(gaussians)
+    local = torch.randn(len(twice), 3, generator=generator) * twice.scales
+    offsets = (quaternions.rotation_matrices(twice.quats) @ local[..., None])[..., 0]
+    return replace(twice, means=twice.means + offsets, log_scales=twice.log_scales - math.log(SPLIT_SHRINK))
+
+
+def lower_opacities(model: Model, opacity: float) -> None:
+    """Cap every opacity, in place, and forget its moments: what the images need comes back, the rest is pruned."""
+    model.gaussians.logit_opacities.clamp_max_(math.log(opacity / (1 - opacity)))
+    model.exp_avg.logit_opacities.zero_()
+    model.exp_avg_sq.logit_opacities.zero_()

@@ -1,0 +1,124 @@
+"""Gaussians as samples of a Markov chain (Kheradmand et al. 2024): relocate the dead, grow to a budget, add noise."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gsopt import quats as quaternions
+from gsopt.config import DensityConfig
+from gsopt.raster.backend import Gradients
+from gsopt.training import schedule
+from gsopt.training.optimizer import Model
+
+# Noise is scaled by sigmoid(-STEEPNESS (o - HALF)): only nearly transparent Gaussians wander (the authors' constants).
+STEEPNESS = 100.0
+HALF = 0.005
+# Above this opacity that factor is below 1e-4 and no noise is drawn: the move would be far below Adam's own.
+STEADY = 0.1
+# One Gaussian stands for at most this many copies in one relocation (the authors' constant).
+MOST_COPIES = 51
+OPAQUE = 1 - 1e-7
+
+
+class Mcmc:
+    """Never prunes: what is transparent is moved on top of what is not, without changing the image."""
+
+    def __init__(self, config: DensityConfig, iterations: int, generator: torch.Generator) -> None:
+        self._config = config
+        self._iterations = iterations
+        self._generator = generator
+
+    def after_backward(
+        self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
+    ) -> None:
+        """Needs no statistics."""
+
+    def after_step(self, model: Model, lr_means: float) -> None:
+        """Stochastic gradient Langevin dynamics: means += lr · noise_lr · sigmoid(-100 (o - 0.005)) · Σ ξ (eq. 10)."""
+        gaussians = model.gaussians
+        rows = torch.nonzero(gaussians.logit_opacities < math.log(STEADY / (1 - STEADY)))[:, 0]
+        if len(rows) == 0:
+            return
+        mobility = torch.sigmoid((HALF - torch.sigmoid(gaussians.logit_opacities[rows])) * STEEPNESS)
+        xi = torch.randn(len(rows), 3, generator=self._generator)
+        R = quaternions.rotation_matrices(gaussians.quats[rows])
+        variances = (2 * gaussians.log_scales[rows]).exp()
+        local = variances * (R.transpose(1, 2) @ xi[..., None])[..., 0]
+        moves = (R @ local[..., None])[..., 0] * mobility[:, None]
+        gaussians.means[rows] += self._config.noise_lr * lr_means * moves
+
+    def refine(self, step: int, model: Model) -> Model:
+        """Move the dead, then grow by a fixed share."""
+        if not schedule.refines(step, self._config, self._iterations):
+            return model
+        self._relocate(model)
+        return self._grow(model)
+
+    def select(self, rows: Tensor) -> None:
+        """Nothing to follow."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Nothing to take back."""
+
+    def _relocate(self, model: Model) -> None:
+        """Move every Gaussian at or below prune_opacity onto one drawn by opacity; in place."""
+        opacities = model.gaussians.opacities
+        dead = torch.nonzero(opacities <= self._config.prune_opacity)[:, 0]
+        if len(dead) in (0, len(model)):
+            return
+        weights = torch.where(opacities > self._config.prune_opacity, opacities, 0.0)
+        sources = draw(weights, len(dead), self._generator)
+        self._share(model, sources)
+        for _, tensor in model.gaussians.items():
+            tensor[dead] = tensor[sources]
+        model.forget(dead)
+
+    def _grow(self, model: Model) -> Model:
+        """Add copies of Gaussians drawn by opacity, up to growth · N or the budget."""
+        target = min(self._config.max_gaussians, int(self._config.growth * len(model)))
+        if target <= len(model):
+            return model
+        sources = draw(model.gaussians.opacities, target - len(model), self._generator)
+        self._share(model, sources)
+        return model.append(model.gaussians.select(sources))
+
+    def _share(self, model: Model, sources: Int[Tensor, "M"]) -> None:
+        """Make every source as faint and as small as if it and its copies drew what it drew alone; in place."""
+        copies = torch.bincount(sources, minlength=len(model)) + 1
+        rows = torch.nonzero(copies > 1)[:, 0]
+        opacities, shrink = shared(model.gaussians.opacities[rows], copies[rows])
+        opacities = opacities.clamp(self._config.prune_opacity, OPAQUE)
+        model.gaussians.logit_opacities[rows] = torch.logit(opacities).float()
+        model.gaussians.log_scales[rows] += shrink.log().float()[:, None]
+        model.forget(rows)
+
+
+def shared(opacities: Float[Tensor, "M"], copies: Int[Tensor, "M"]) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
+    """Opacity of n coinciding copies of one Gaussian, and the factor on its scales (eq. 9); float64.
+
+    o' = 1 - (1 - o)^(1/n), and the factor is o / Σ_{j=1..n} C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum over
+    i and k with Σ_i C(i-1, k) = C(n, k+1) carried out, j = k + 1.
+    """
+    n = copies.clamp_max(MOST_COPIES).double()
+    o = opacities.double().clamp_max(OPAQUE)
+    new = 1 - (1 - o) ** (1 / n)
+    total = torch.zeros_like(o)
+    term = torch.full_like(o, -1.0)
+    for j in range(1, int(n.max()) + 1 if len(n) else 1):
+        term = -term * new * (n - j + 1).clamp_min(0) / j  # (-1)^(j-1) C(n, j) o'^j, zero for j > n
+        total += term / math.sqrt(j)
+    return new, o / total
+
+
+def draw(weights: Float[Tensor, "N"], count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
+    """Rows drawn with replacement in proportion to their weights (any N, unlike torch.multinomial)."""
+    cumulative = weights.double().cumsum(0)
+    points = torch.rand(count, dtype=torch.float64, generator=generator) * cumulative[-1]
+    return torch.searchsorted(cumulative, points, right=True).clamp_max(len(weights) - 1)

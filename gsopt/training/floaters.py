@@ -1,0 +1,40 @@
+"""Finds Gaussians that hang alone in space by the distance to their neighbours (GaussianObject, Yang et al. 2024)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+# Neighbours are looked for among at most this many Gaussians: the estimate of the local density stays, the cost does
+# not grow with the square of N. The rows are in Morton order, so that an even stride is an even sample of space.
+MOST_REFERENCES = 2048
+FEWEST = 64
+"""Below this many Gaussians the statistics mean nothing and none is called a floater."""
+CHUNK = 1024
+
+
+def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:
+    """Whether the mean distance to the nearest neighbours exceeds its average by `sigmas` standard deviations."""
+    if len(means) < FEWEST:
+        return torch.zeros(len(means), dtype=torch.bool)
+    distances = neighbor_distances(means)
+    return distances > distances.mean() + sigmas * distances.std()
+
+
+def neighbor_distances(means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    """Mean distance, scene units, to the nearest √N neighbours, or to the same share of at most 2048 references."""
+    count = len(means)
+    stride = -(-count // MOST_REFERENCES)
+    references = means[::stride]
+    nearest = max(3, round(math.sqrt(count) / stride))
+    chunks = []
+    for begin in range(0, count, CHUNK):
+        rows = torch.arange(begin, min(begin + CHUNK, count))
+        distances = torch.cdist(means[rows], references, compute_mode="donot_use_mm_for_euclid_dist")
+        own = rows % stride == 0
+        distances[own.nonzero()[:, 0], rows[own] // stride] = math.inf
+        chunks.append(distances.topk(nearest, largest=False).values.mean(dim=1))
+    return torch.cat(chunks)

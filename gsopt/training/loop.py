@@ -1,0 +1,241 @@
+"""`train`: from a configuration to splat.ply, with checkpoints and events on the way."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gsopt import init as beginning
+from gsopt.config import TrainConfig
+from gsopt.data.scene import Scene, load_scene
+from gsopt.errors import InputError
+from gsopt.formats import save_splats
+from gsopt.gaussians import Gaussians
+from gsopt.raster.api import make_backend
+from gsopt.raster.backend import Backend
+from gsopt.training import schedule
+from gsopt.training.checkpoint import load_newest, save_checkpoint, saved, sweep
+from gsopt.training.guard import require_finite, require_finite_loss
+from gsopt.training.interrupt import StopRequest
+from gsopt.training.run_directory import Listener, RunDirectory, opened
+from gsopt.training.trainer import Trainer
+
+PROGRESS_SECONDS = 0.5
+# Every parameter is looked at this often; the loss is looked at in every step.
+GUARD_EVERY = 100
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a run left behind."""
+
+    run: Path
+    gaussians: Gaussians
+    scene: Scene
+    backend: str
+    init: str
+    """How the first Gaussians were made."""
+    steps: int
+    """Steps taken, earlier sessions of a resumed run included."""
+    stopped: bool
+    """True when someone asked it to stop before it was finished."""
+    train_seconds: float
+    """Wall time of the steps, checkpoints and previews; without reading the data and making the first Gaussians."""
+    peak_memory_mb: float | None
+    """Largest resident set of this process since it started, interpreter and libraries included; None on Windows."""
+
+
+@torch.no_grad()
+def train(
+    config: TrainConfig, run: Path, *, resume: bool = False, on_progress: Listener | None = None, done: bool = True
+) -> TrainResult:
+    """Optimise Gaussians for the scene in `config.data` and write `run` (see gsopt/events.py for what is in there).
+
+    `resume` continues from the newest checkpoint in `run`, with the same bits as if it had never stopped; without
+    one it starts. `on_progress` is called with every event. `done`: end with the event `done`; a caller that adds an
+    evaluation says False and emits it afterwards. SIGINT, SIGTERM and a file `stop` end the run after its step.
+
+    Raises UsageError for a folder that holds another run, InputError for unusable data, NumericalError when a value
+    stops being finite.
+    """
+    with opened(Path(run), config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
+        with one_torch_thread():
+            backend = make_backend(config.backend, config.threads)
+            scene = load_scene(config.data)
+            trainer, seconds = _start(config, scene, backend, directory)
+            clock = Clock(trainer.step, seconds)
+            stopped = _advance(trainer, directory, stop, clock)
+            _finish(trainer, directory, clock.seconds())
+        if stopped or done:
+            kind = "stopped" if stopped else "done"
+            directory.emit(kind, step=trainer.step, n=len(trainer.model), seconds=round(clock.seconds(), 3))
+        return TrainResult(
+            run=directory.path,
+            gaussians=trainer.model.gaussians,
+            scene=scene,
+            backend=backend.name,
+            init=str(directory.recorded("gaussians_init")),
+            steps=trainer.step,
+            stopped=stopped,
+            train_seconds=clock.seconds(),
+            peak_memory_mb=peak_memory_mb(),
+        )
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch's own threads off: its reductions add up in another order for every number of threads.
+
+    The backend has its own threads and the same bits for any number of them; what is left to torch is a small part
+    of a step.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class Clock:
+    """Wall time of a run, over all its sessions, and its recent speed."""
+
+    def __init__(self, step: int, seconds: float) -> None:
+        self._began = time.perf_counter() - seconds
+        self._told, self._told_step = time.perf_counter(), step
+        self._rate = 0.0
+
+    def seconds(self) -> float:
+        return time.perf_counter() - self._began
+
+    def is_due(self) -> bool:
+        """Whether progress was last told long enough ago."""
+        return time.perf_counter() - self._told >= PROGRESS_SECONDS
+
+    def rate(self, step: int) -> float:
+        """Steps per second, averaged over the last few calls."""
+        now = time.perf_counter()
+        rate = (step - self._told_step) / max(now - self._told, 1e-9)
+        self._rate = rate if self._rate == 0 else 0.7 * self._rate + 0.3 * rate
+        self._told, self._told_step = now, step
+        return self._rate
+
+
+def _start(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> tuple[Trainer, float]:
+    """A trainer at step 0 or at the newest checkpoint, and the seconds already spent."""
+    names = [view.name for view in scene.train]
+    sweep(directory.checkpoints)
+    checkpoint = load_newest(directory.checkpoints, directory.warn)
+    if checkpoint is None:
+        highest = schedule.max_sh_degree(config, len(names))
+        gaussians, init = beginning.first_gaussians(scene, config.init, highest, config.seed)
+        if len(gaussians) == 0:
+            raise InputError(f"`{init}` made no Gaussians. Choose another --init.")
+        directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin))
+        trainer, seconds = Trainer(config, scene, gaussians, backend), 0.0
+    else:
+        if names != directory.recorded("train_views"):
+            raise InputError(f"{config.data.path} has other views than when the run began. Start in another folder.")
+        trainer = Trainer.resumed(config, scene, backend, checkpoint)
+        seconds = float(checkpoint.meta.get("seconds", 0.0))
+    directory.emit(
+        "started",
+        total=config.iterations,
+        step=trainer.step,
+        pid=os.getpid(),
+        backend=backend.name,
+        init=directory.recorded("gaussians_init"),
+        n=len(trainer.model),
+        train_views=len(names),
+        test_views=len(scene.test),
+        sparse=schedule.is_sparse(config, len(names)),
+    )
+    for warning in scene.warnings:
+        directory.warn(warning)
+    return trainer, seconds
+
+
+def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:
+    """Step until the end; True when asked to stop before it."""
+    config = trainer.config
+    while trainer.step < config.iterations and not trainer.finished_early:
+        if stop:
+            return True
+        loss, view = trainer.advance()
+        require_finite_loss(loss, view, trainer.step, _last_good(directory))
+        if trainer.step % GUARD_EVERY == 0:
+            _guard(trainer, directory)
+        if is_due(trainer.step, config.checkpoint_every):
+            _save(trainer, directory, clock.seconds())
+        if is_due(trainer.step, config.preview_every):
+            _preview(trainer, directory)
+        if clock.is_due() or trainer.step == config.iterations or trainer.finished_early:
+            _tell(trainer, directory, clock)
+    return False
+
+
+def is_due(step: int, every: int) -> bool:
+    return every > 0 and step % every == 0
+
+
+def _finish(trainer: Trainer, directory: RunDirectory, seconds: float) -> None:
+    """The last checkpoint and splat.ply."""
+    _save(trainer, directory, seconds)
+    save_splats(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.config.antialiased)
+
+
+def _save(trainer: Trainer, directory: RunDirectory, seconds: float) -> None:
+    """A checkpoint, never of numbers that are no longer numbers."""
+    _guard(trainer, directory)
+    tensors, meta = trainer.state()
+    save_checkpoint(directory.checkpoints, trainer.step, tensors, {**meta, "seconds": seconds})
+
+
+def _preview(trainer: Trainer, directory: RunDirectory) -> None:
+    """The splats so far: written, closed, then announced."""
+    _guard(trainer, directory)
+    path = directory.previews / f"step_{trainer.step:06d}.ply"
+    save_splats(path, trainer.model.gaussians, antialiased=trainer.config.antialiased)
+    directory.emit("preview", step=trainer.step, path=path.relative_to(directory.path).as_posix())
+
+
+def _tell(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
+    rate = clock.rate(trainer.step)
+    left = trainer.config.iterations - trainer.step
+    psnr = trainer.shown.psnr
+    directory.emit(
+        "progress",
+        step=trainer.step,
+        total=trainer.config.iterations,
+        loss=trainer.shown.loss,
+        psnr=None if psnr is None else round(psnr, 3),
+        n=len(trainer.model),
+        steps_per_second=round(rate, 3),
+        eta_seconds=round(left / rate, 1) if rate > 0 else None,
+        seconds=round(clock.seconds(), 3),
+    )
+
+
+def _guard(trainer: Trainer, directory: RunDirectory) -> None:
+    require_finite(trainer.model.gaussians.items(), trainer.step, _last_good(directory))
+
+
+def _last_good(directory: RunDirectory) -> Path | None:
+    return next(iter(saved(directory.checkpoints)), None)
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident set of this process so far, MB (10^6 bytes)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB on Linux, bytes on macOS
+    return peak * (1 if sys.platform == "darwin" else 1024) / 1e6

@@ -1,0 +1,34 @@
+"""Z-order: Gaussians that are near in space become near in memory, which the kernels' caches like."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+BITS = 21  # per axis: three axes fill 63 bits
+# Each step moves the upper half of the bits up, until two zeros stand between any two (Morton 1966).
+SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def morton_order(means: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
+    """Indices that sort the points along a Z curve through their bounding box; equal codes keep their order."""
+    if len(means) == 0:
+        return torch.empty(0, dtype=torch.int64)
+    low, high = means.amin(dim=0), means.amax(dim=0)
+    cells = (means - low).double() / (high - low).double().clamp_min(1e-30) * (2**BITS - 1)
+    x, y, z = (_spread(axis) for axis in cells.to(torch.int64).unbind(-1))
+    return torch.argsort(x | (y << 1) | (z << 2), stable=True)
+
+
+def _spread(values: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    """Two zero bits between every two bits of a 21-bit number."""
+    for shift, mask in SPREAD:
+        values = (values | (values << shift)) & mask
+    return values

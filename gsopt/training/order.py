@@ -1,0 +1,36 @@
+"""Explicit random numbers: one generator per purpose, and the order in which views are seen."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+PURPOSES = ("views", "background", "dropout", "density")
+
+
+def generators(seed: int) -> dict[str, torch.Generator]:
+    """A CPU generator per purpose, so that what one draws does not move the others."""
+    return {name: torch.Generator().manual_seed(seed * len(PURPOSES) + i) for i, name in enumerate(PURPOSES)}
+
+
+class ViewOrder:
+    """Every view once per epoch, shuffled anew for each (Kerbl et al. 2023)."""
+
+    def __init__(self, views: int, generator: torch.Generator) -> None:
+        self._generator = generator
+        self._views = views
+        self.order = torch.empty(0, dtype=torch.int64)
+        """This epoch's views."""
+        self.position = 0
+        """How many of them were seen."""
+
+    def next(self) -> int:
+        """The view of the next step."""
+        if self.position >= len(self.order):
+            self.order = torch.randperm(self._views, generator=self._generator)
+            self.position = 0
+        self.position += 1
+        return int(self.order[self.position - 1])
+
+    def restore(self, order: Tensor, position: int) -> None:
+        self.order, self.position = order, position

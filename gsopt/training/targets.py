@@ -1,0 +1,76 @@
+"""What a step compares the rendering with: a view's pixels on a background, as floats, at the step's resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gsopt.cameras import Cameras
+from gsopt.data.resample import area_downscale, downscaled_size, premultiply
+from gsopt.data.scene import View
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class Target:
+    """One view, ready to be compared."""
+
+    camera: Cameras
+    colors: Float[Tensor, "H W 3"]
+    """On the background of the step."""
+    alphas: Float[Tensor, "H W"] | None
+    """None where the image has no alpha and no mask."""
+
+
+class Targets:
+    """Float targets of all input views. Keeps as many as fit into `budget` bytes, in the order they are asked for.
+
+    With a fixed background the composited color is kept; with a random one the premultiplied color, to which the
+    background is added at every step.
+    """
+
+    def __init__(self, views: Sequence[View], fixed: Float[Tensor, "3"] | None, budget: int) -> None:
+        self._views = views
+        self._fixed = fixed
+        self._budget = budget
+        self._factor = 1
+        self._kept: dict[int, Target] = {}
+        self._bytes = 0
+
+    def get(self, index: int, factor: int, background: Float[Tensor, "3"]) -> Target:
+        """View `index` with width and height divided by `factor`. The tensors belong to the cache: do not write."""
+        if factor != self._factor:
+            self._kept.clear()
+            self._factor, self._bytes = factor, 0
+        target = self._kept.get(index) or self._make(index)
+        if self._fixed is not None or target.alphas is None:
+            return target
+        colors = torch.addcmul(target.colors, 1 - target.alphas[..., None], background)
+        return Target(target.camera, colors, target.alphas)
+
+    def _make(self, index: int) -> Target:
+        view = self._views[index]
+        height, width = (downscaled_size(extent, self._factor) for extent in (view.camera.height, view.camera.width))
+        colors, alphas = premultiplied(view.pixels(), width, height)
+        if self._fixed is not None and alphas is not None:
+            colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed)
+        target = Target(view.camera.to(torch.float32).resized(width, height), colors, alphas)
+        size = colors.nbytes + (0 if alphas is None else alphas.nbytes)
+        if self._bytes + size <= self._budget:
+            self._kept[index] = target
+            self._bytes += size
+        return target
+
+
+def premultiplied(
+    pixels: UInt8[Tensor, "H W C"], width: int, height: int
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    """Bytes to color times alpha, and alpha (None for three channels), both 0..1 and area-filtered."""
+    planes = area_downscale(premultiply(pixels), width, height) / 255
+    colors = planes[:3].permute(1, 2, 0).contiguous()
+    return colors, planes[3].contiguous() if len(planes) == 4 else None

@@ -1,0 +1,234 @@
+"""One optimisation, step by step, and everything that a checkpoint must carry to continue it bit for bit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.config import TrainConfig
+from gsopt.data.scene import Scene
+from gsopt.errors import InputError
+from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.raster.backend import Backend, Gradients, RasterSettings
+from gsopt.training import schedule
+from gsopt.training.checkpoint import Checkpoint
+from gsopt.training.density import at_least_one, make_density
+from gsopt.training.floaters import solitary
+from gsopt.training.morton import morton_order
+from gsopt.training.optimizer import Model, adam_step, learning_rates
+from gsopt.training.order import ViewOrder, generators
+from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
+from gsopt.training.targets import BACKGROUNDS, Target, Targets
+
+# The PSNR that is shown is taken every so many steps: the mean squared error costs a pass over the image.
+PSNR_EVERY = 10
+# Share of a new value in the running means that are shown.
+NEWS = 0.05
+# Most memory for float targets, as a share of the decoded images': both hold the same views.
+TARGET_SHARE = 0.5
+# The parts of a model that a checkpoint carries.
+RECORDS = ("gaussians", "exp_avg", "exp_avg_sq")
+
+
+@dataclass
+class Shown:
+    """Running means over steps, for people: nothing is decided by them."""
+
+    loss: float | None = None
+    mse: float | None = None
+
+    @property
+    def psnr(self) -> float | None:
+        """dB, from the running mean squared error over the input views as they were drawn; capped at 100."""
+        return None if self.mse is None else -10 * math.log10(max(self.mse, 1e-10))
+
+
+class Trainer:
+    """Owns the model, its density control and all random numbers of one run."""
+
+    def __init__(self, config: TrainConfig, scene: Scene, gaussians: Gaussians, backend: Backend) -> None:
+        views = len(scene.train)
+        self.config = config
+        self.scene = scene
+        self.backend = backend
+        self.step = 0
+        self.shown = Shown()
+        self.finished_early = False
+        self._sparse = schedule.is_sparse(config, views)
+        self._weights = schedule.weights(config, views)
+        self._max_sh_degree = schedule.max_sh_degree(config, views)
+        self._generators = generators(config.seed)
+        self._order = ViewOrder(views, self._generators["views"])
+        self._flatness = schedule.Flatness.of(views)
+        fixed = BACKGROUNDS.get(config.data.background)
+        self._background = None if fixed is None else torch.tensor(fixed)
+        self._targets = Targets(scene.train, self._background, int(TARGET_SHARE * config.data.cache_mb * 1e6))
+        self._extent = scene.extent
+        self.model = Model.start(self._first(gaussians))
+        self._density = make_density(config, self._extent, len(self.model), self._generators["density"])
+
+    def _first(self, gaussians: Gaussians) -> Gaussians:
+        """The first Gaussians within the budget, in Morton order, as float32 with the run's bands."""
+        gaussians = gaussians.to(torch.float32).with_sh_degree(self._max_sh_degree)
+        excess = len(gaussians) > self.config.density.max_gaussians
+        if excess:
+            chosen = torch.randperm(len(gaussians), generator=self._generators["density"])
+            gaussians = gaussians.select(chosen[: self.config.density.max_gaussians])
+        return gaussians.select(morton_order(gaussians.means))
+
+    def advance(self) -> tuple[float, str]:
+        """Take one step; returns its photometric loss and the name of its view."""
+        self.step += 1
+        index = self._order.next()
+        background = self._background if self._background is not None else self._random_background()
+        target = self._targets.get(index, schedule.downscale(self.step, self.config.schedule.coarse_until), background)
+        settings = RasterSettings(
+            sh_degree=schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree),
+            antialiased=self.config.antialiased,
+        )
+        loss, gradients = self._gradients(target, background, settings)
+        self._update(gradients, settings.sh_degree)
+        self._change_set()
+        self.finished_early = self._is_flat(loss)
+        return loss, self.scene.train[index].name
+
+    def _random_background(self) -> Float[Tensor, "3"]:
+        return torch.rand(3, generator=self._generators["background"])
+
+    def _gradients(
+        self, target: Target, background: Float[Tensor, "3"], settings: RasterSettings
+    ) -> tuple[float, Gradients]:
+        """Forward, loss, backward, regularisers; density control takes note."""
+        gaussians, dropout = self._drawn()
+        frame = self.backend.forward(gaussians, target.camera, settings, background)
+        photometric = self.backend.photometric(frame.colors, target.colors, self.config.loss.lambda_dssim)
+        v_alphas = None
+        if self._weights.alpha > 0 and target.alphas is not None:
+            v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha)
+        absgrad = self.config.density.absgrad and self.config.density.strategy == "adc"
+        gradients = self.backend.backward(frame, photometric.v_colors, v_alphas, absgrad=absgrad)
+        self._density.after_backward(self.step, gradients, frame.radii, target.camera.width, target.camera.height)
+        self._show(photometric.loss, frame.colors, target.colors)
+        return photometric.loss, self._regularized(gradients, dropout)
+
+    def _drawn(self) -> tuple[Gaussians, Dropout | None]:
+        """The Gaussians of this step: all of them, or with few views a random part."""
+        gaussians = self.model.gaussians
+        rate = schedule.dropout(self.step, self.config.iterations, self.config) if self._sparse else 0.0
+        if rate == 0:
+            return gaussians, None
+        dropout = Dropout.draw(len(gaussians), rate, self._generators["dropout"])
+        return dropout.apply(gaussians), dropout
+
+    def _regularized(self, gradients: Gradients, dropout: Dropout | None) -> Gradients:
+        """With respect to the stored parameters, terms beside the photometric loss included."""
+        gaussians = self.model.gaussians
+        if dropout is not None:
+            chained = dropout.chain(gradients.logit_opacities, gaussians.logit_opacities)
+            gradients = replace(gradients, logit_opacities=chained)
+        if self._weights.opacity > 0:
+            add_opacity_gradient(gradients.logit_opacities, gaussians.logit_opacities, self._weights.opacity)
+        if self._weights.scale > 0:
+            add_scale_gradient(gradients.log_scales, gaussians.log_scales, self._weights.scale)
+        return gradients
+
+    def _update(self, gradients: Gradients, sh_degree: int) -> None:
+        """Adam, then what density control adds to a step."""
+        config = self.config.optimizer
+        lr_means = schedule.lr_means(self.step, self.config.iterations, config, self._extent)
+        rates = learning_rates(config, lr_means)
+        adam_step(self.model, gradients, rates, config, self.backend, sh_degree=sh_degree)
+        self._density.after_step(self.model, lr_means)
+
+    def _change_set(self) -> None:
+        """Add, remove and reorder Gaussians where this step asks for it."""
+        refined = self._density.refine(self.step, self.model)
+        moved = refined is not self.model
+        self.model = refined
+        if self._sparse and schedule.prunes_floaters(self.step, self.config.iterations, self.config):
+            sigmas = schedule.floater_sigmas(self.step, self.config.iterations)
+            gaussians = self.model.gaussians
+            self._select(at_least_one(~solitary(gaussians.means, sigmas), gaussians.logit_opacities))
+            moved = True
+        if moved:
+            self._select(morton_order(self.model.gaussians.means))
+
+    def _select(self, rows: Tensor) -> None:
+        self.model = self.model.select(rows)
+        self._density.select(rows)
+
+    def _show(self, loss: float, rendered: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> None:
+        shown = self.shown
+        shown.loss = loss if shown.loss is None else (1 - NEWS) * shown.loss + NEWS * loss
+        if self.step % PSNR_EVERY == 1:
+            mse = float(torch.nn.functional.mse_loss(rendered, target))
+            shown.mse = mse if shown.mse is None else (1 - NEWS) * shown.mse + NEWS * mse
+
+    def _is_flat(self, loss: float) -> bool:
+        """Whether the run may end here; counts only after the last refinement and band."""
+        config = self.config
+        settled = max(
+            schedule.refine_stop(config.density, config.iterations),
+            self._max_sh_degree * config.optimizer.sh_degree_every,
+            *config.schedule.coarse_until,
+            0,
+        )
+        return config.schedule.stop_when_flat and self.step > settled and self._flatness.update(loss)
+
+    @staticmethod
+    def resumed(config: TrainConfig, scene: Scene, backend: Backend, checkpoint: Checkpoint) -> Trainer:
+        """A trainer as it was when the checkpoint was written; InputError when that belongs to another run."""
+        try:
+            trainer = Trainer(config, scene, _record(checkpoint.tensors, "gaussians"), backend)
+            trainer._restore(checkpoint.tensors, checkpoint.meta)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"The checkpoint {checkpoint.path} lacks or garbles {error}. Remove it, or start in another folder."
+            ) from error
+        return trainer
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """All that the next step depends on: tensors, and what JSON can hold exactly."""
+        tensors = {f"{kind}.{name}": t for kind in RECORDS for name, t in getattr(self.model, kind).items()}
+        tensors |= {f"density.{name}": tensor for name, tensor in self._density.tensors().items()}
+        tensors |= {f"rng.{name}": generator.get_state() for name, generator in self._generators.items()}
+        tensors["epoch.order"] = self._order.order
+        meta = {
+            "step": self.step,
+            "adam_steps": self.model.steps,
+            "epoch_position": self._order.position,
+            "flatness": {field.name: getattr(self._flatness, field.name) for field in fields(self._flatness)},
+            "finished_early": self.finished_early,
+            "shown": {"loss": self.shown.loss, "mse": self.shown.mse},
+        }
+        return tensors, meta
+
+    def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
+        """Inverse of `state`."""
+        gaussians, exp_avg, exp_avg_sq = (_record(tensors, kind) for kind in RECORDS)
+        _require_same_shapes(gaussians.validate(), exp_avg, exp_avg_sq)
+        self.model = Model(gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS})
+        self._density.restore({k.removeprefix("density."): v for k, v in tensors.items() if k.startswith("density.")})
+        for name, generator in self._generators.items():
+            generator.set_state(tensors[f"rng.{name}"])
+        self._order.restore(tensors["epoch.order"], int(meta["epoch_position"]))
+        self._flatness = schedule.Flatness(**meta["flatness"])
+        self.finished_early = bool(meta["finished_early"])
+        self.shown = Shown(**meta["shown"])
+        self.step = int(meta["step"])
+
+
+def _record(tensors: dict[str, Tensor], kind: str) -> Gaussians:
+    return Gaussians(**{name: tensors[f"{kind}.{name}"] for name in PARAMETERS})
+
+
+def _require_same_shapes(gaussians: Gaussians, *moments: Gaussians) -> None:
+    for record in moments:
+        for name, tensor in gaussians.items():
+            if getattr(record, name).shape != tensor.shape:
+                raise ValueError(f"the shape of {name}")
