@@ -44,8 +44,22 @@ def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased:
             from gsopt.formats.ply import save_ply
 
             save_ply(path, gaussians, antialiased=antialiased)
-        case other:
-            raise InputError(f"{path}: {other} cannot be written yet. Use .ply.")
+        case ".compressed.ply":
+            from gsopt.formats.compressed_ply import save_compressed_ply
+
+            save_compressed_ply(path, gaussians)
+        case ".splat":
+            from gsopt.formats.splat import save_splat
+
+            save_splat(path, gaussians)
+        case ".spz":
+            from gsopt.formats.spz import save_spz
+
+            save_spz(path, gaussians, antialiased=antialiased)
+        case ".glb":
+            from gsopt.formats.gltf import save_glb
+
+            save_glb(path, gaussians)
 
 
 def load_splats(path: str | PathLike[str]) -> Gaussians:
@@ -56,9 +70,19 @@ def load_splats(path: str | PathLike[str]) -> Gaussians:
     """
     path = Path(path)
     match suffix_of(path):
-        case ".ply":
-            from gsopt.formats.ply import load_ply
+        case ".splat":
+            from gsopt.formats.splat import load_splat
 
-            return load_ply(path)
-        case other:
-            raise InputError(f"{path}: {other} cannot be read yet. Use .ply.")
+            return load_splat(path)
+        case ".spz":
+            from gsopt.formats.spz import load_spz
+
+            return load_spz(path)
+        case ".glb":
+            from gsopt.formats.gltf import load_glb
+
+            return load_glb(path)
+        case _:
+            from gsopt.formats.compressed_ply import load_any_ply
+
+            return load_any_ply(path)

@@ -145,6 +145,6 @@ def _bands(vertex: Element, path: Path) -> int:
     if len(rest) not in _BANDS or rest != {f"f_rest_{i}" for i in range(len(rest))}:
         raise InputError(
             f"{path} must have f_rest_0 to f_rest_(m-1) with m one of {', '.join(map(str, _BANDS))} "
-            f"(SH degree 0 to {MAX_SH_DEGREE}), got {len(rest)} of them. Export it with SH degree {MAX_SH_DEGREE} or less."
+            f"(SH degree 0 to {MAX_SH_DEGREE}), got {len(rest)} of them. Export it with one of these degrees."
         )
     return _BANDS[len(rest)]

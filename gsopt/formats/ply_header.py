@@ -53,6 +53,10 @@ class Element:
     def names(self) -> tuple[str, ...]:
         return tuple(name for name, _ in self.columns)
 
+    def columns_of(self, kind: str) -> tuple[str, ...]:
+        """Names of the properties of one numpy type, in file order."""
+        return tuple(name for name, its_kind in self.columns if its_kind == kind)
+
     @property
     def has_lists(self) -> bool:
         return any(kind is None for _, kind in self.columns)
@@ -87,9 +91,7 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         )
     end = _END.search(head)
     if end is None:
-        raise InputError(
-            f"{path} has no `end_header` in its first {min(len(head), MAX_HEADER)} bytes. It is damaged: export it again."
-        )
+        raise InputError(f"{path} has no `end_header` in its first {len(head)} bytes. It is damaged: export it again.")
     file.seek(end.end())
     lines = head[: end.start()].decode("latin-1").splitlines()[1:]
     return _parse(lines, path, end.end())

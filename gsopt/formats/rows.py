@@ -13,6 +13,10 @@ from gsopt.gaussians import Gaussians
 MAX_SH_DEGREE = 3
 _XYZ = "xyz"
 _TINY = torch.finfo(torch.float32).tiny
+_MAX_LOG = 87.0
+"""exp(±87) are normal float32 numbers."""
+BYTE_OPACITY_MARGIN = 0.25 / 255
+"""How far a byte's opacities 0 and 255 are kept from 0 and 1: their logits are finite and round to the same byte."""
 
 
 def storable(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -67,3 +71,18 @@ def ply_name(parameter: str, index: list[int], bands: int) -> str:
 def logit(opacities: Tensor, quantum: float = 0.0) -> Tensor:
     """ln(p / (1 - p)) of opacities in [0, 1], kept `quantum` away from the ends so that it stays finite."""
     return torch.logit(opacities.double().clamp(quantum, 1.0 - quantum)).float()
+
+
+def scales(log_scales: Tensor) -> Tensor:
+    """exp(log_scales) held inside the range of a normal float32, so that its logarithm is finite again."""
+    return log_scales.clamp(-_MAX_LOG, _MAX_LOG).exp()
+
+
+def log_scales(scales: Tensor) -> Tensor:
+    """Natural logarithm of scales; 0 counts as the least normal float32, negative ones give NaN for `checked`."""
+    return torch.where(scales < 0, torch.nan, scales.clamp_min(_TINY)).log()
+
+
+def to_bytes(values: Tensor) -> Tensor:
+    """Values rounded and held to 0..255."""
+    return values.round().clamp(0, 255).to(torch.uint8)

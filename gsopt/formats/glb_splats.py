@@ -1,0 +1,134 @@
+"""Finding splats in a glTF document: which primitives, which accessors, which bytes.
+
+Sources: Khronos, glTF 2.0, section 3.6 (accessors and their normalised integers), and KHR_gaussian_splatting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsopt.formats.files import read_exactly
+from gsopt.formats.glb_container import Document
+
+EXTENSION = "KHR_gaussian_splatting"
+_UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization"}
+_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_IDENTITY = {
+    "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+    "translation": [0, 0, 0],
+    "rotation": [0, 0, 0, 1],
+    "scale": [1, 1, 1],
+}
+
+
+@dataclass(frozen=True)
+class Accessor:
+    """A checked view of `count` elements inside the file."""
+
+    offset: int
+    """Bytes from the start of the file."""
+    stride: int
+    count: int
+    components: int
+    kind: np.dtype
+    normalized: bool
+
+    def read(self, file: BinaryIO, document: Document) -> NDArray[np.float32]:
+        """Values [count, components] as float32, normalised integers brought to [0, 1] or [-1, 1]."""
+        element = self.components * self.kind.itemsize
+        file.seek(self.offset)
+        data = read_exactly(file, self.stride * (self.count - 1) + element, document.path, "an accessor")
+        shape, strides = (self.count, self.components), (self.stride, self.kind.itemsize)
+        values = np.ndarray(shape, self.kind, data, 0, strides).astype(np.float32)
+        if self.normalized and self.kind.kind != "f":
+            values = np.maximum(values / np.float32(np.iinfo(self.kind).max), np.float32(-1))
+        return values
+
+
+def splat_primitives(document: Document) -> list[dict[str, Accessor]]:
+    """Semantic -> accessor of every primitive of splats; InputError when there is none or one cannot be read right."""
+    unknown = sorted(set(document.names("extensionsRequired")) - _UNDERSTOOD)
+    if unknown:
+        document.fail(f"needs extensions that gsopt does not know: {', '.join(unknown)[:80]}")
+    found = []
+    for mesh, description in enumerate(document.objects(document.root, "meshes")):
+        for primitive in document.objects(description, "primitives"):
+            if EXTENSION in document.object(primitive, "extensions"):
+                _check_extension(document, document.object(document.object(primitive, "extensions"), EXTENSION))
+                _check_placement(document, mesh)
+                attributes = document.object(primitive, "attributes")
+                found.append({name: _accessor(document, attributes, name) for name in attributes if _wanted(name)})
+    if not found:
+        document.fail(f"has no primitive with {EXTENSION}, so it holds no splats")
+    # Every splat has its own 12 bytes of position: primitives that share them would multiply what a small file takes.
+    if 12 * sum(primitive["POSITION"].count for primitive in found if "POSITION" in primitive) > document.length:
+        document.fail("its primitives share their positions")
+    return found
+
+
+def _wanted(name: str) -> bool:
+    return name == "POSITION" or name.startswith(f"{EXTENSION}:")
+
+
+def _check_extension(document: Document, extension: Mapping[str, Any]) -> None:
+    known = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    for key, value in known.items():
+        if extension.get(key, value) != value:
+            document.fail(f"`{key}` must be {value}, got {str(extension[key])[:40]}")
+    if document.object(extension, "extensions"):
+        document.fail(f"its splats are compressed ({', '.join(extension['extensions'])[:80]})")
+
+
+def _check_placement(document: Document, mesh: int) -> None:
+    """InputError if a node moves, turns or scales this mesh: the splats' harmonics would have to turn along."""
+    nodes = document.objects(document.root, "nodes")
+    pending = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
+    parents: dict[int, list[int]] = {}
+    for i, node in enumerate(nodes):
+        for child in node.get("children", []) if isinstance(node.get("children", []), list) else []:
+            parents.setdefault(child, []).append(i) if isinstance(child, int) else None
+    seen: set[int] = set()
+    while pending:
+        i = pending.pop()
+        if i not in seen:
+            seen.add(i)
+            pending += parents.get(i, [])
+            moved = [key for key, value in _IDENTITY.items() if nodes[i].get(key, value) != value]
+            if moved:
+                document.fail(f"node {i} has a {moved[0]}, which is not applied. Apply it where the file was made")
+
+
+def _accessor(document: Document, attributes: Mapping[str, Any], name: str) -> Accessor:
+    description = document.item("accessors", document.integer(attributes, name))
+    if "sparse" in description:
+        document.fail(f"the accessor of {name} is sparse, which is not read")
+    view = document.item("bufferViews", document.integer(description, "bufferView"))
+    if document.integer(view, "buffer") or "uri" in document.item("buffers", 0) or "extensions" in view:
+        document.fail(f"{name} must lie uncompressed in the file's own binary chunk")
+    count = document.integer(description, "count")
+    kind, components = description.get("componentType"), description.get("type")
+    if (
+        not isinstance(kind, int)
+        or not isinstance(components, str)
+        or kind not in _KINDS
+        or components not in _COMPONENTS
+    ):
+        document.fail(f"{name} must be numbers or vectors, got {str(components)[:20]} of {str(kind)[:20]}")
+    dtype, width = np.dtype(_KINDS[kind]), _COMPONENTS[components]
+    element = width * dtype.itemsize
+    stride = document.integer(view, "byteStride", element)
+    begin = document.integer(view, "byteOffset", 0)
+    length = document.integer(view, "byteLength")
+    inside = document.integer(description, "byteOffset", 0)
+    if not (element <= stride <= max(252, element)) or count < 1 or begin + length > document.length:
+        document.fail(f"{name}: {count} elements every {stride} bytes do not fit {document.length} bytes")
+    if inside + stride * (count - 1) + element > length:
+        document.fail(f"{name} claims {count} elements, but its view has {length} bytes")
+    normalized = description.get("normalized") is True
+    return Accessor(document.start + begin + inside, stride, count, width, dtype, normalized)

@@ -1,0 +1,153 @@
+"""glTF 2.0 binary (.glb) with KHR_gaussian_splatting: splats as a primitive of points.
+
+Attributes POSITION, KHR_gaussian_splatting:ROTATION (unit, x y z w), :SCALE (linear), :OPACITY (0..1) and
+:SH_DEGREE_l_COEF_n; COLOR_0 colors the points where the extension is not known. Sources: Khronos, glTF 2.0, sections
+3.6 and 4.4, and extensions/2.0/Khronos/KHR_gaussian_splatting/README.md. The frame is left, up, forward.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import gsopt
+from gsopt import sh
+from gsopt.errors import InputError
+from gsopt.formats.files import opened, replacing
+from gsopt.formats.frames import LEFT_UP_FORWARD, turned
+from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Document, read_container
+from gsopt.formats.glb_splats import EXTENSION, Accessor, splat_primitives
+from gsopt.formats.rows import MAX_SH_DEGREE, checked, log_scales, logit, scales, storable, to_bytes
+from gsopt.gaussians import Gaussians
+from gsopt.quats import normalize
+
+_FLOAT, _BYTE = 5126, 5121
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_MAX_SIZE = (1 << 32) - 1
+_OPACITY_MARGIN = 2.0**-25
+"""Nearer to 0 or 1 a float32 sigmoid cannot say."""
+
+
+def save_glb(path: Path, gaussians: Gaussians) -> None:
+    """Write one primitive of points; whole file or nothing, 4 GiB at most (about 17 million splats of degree 3).
+
+    Reading back differs by at most: means and spherical harmonics 0; log-scales 1e-5 within ±87; opacity 1e-7; each
+    component of the unit quaternion 1e-7. The order of the rows is kept.
+    """
+    if len(gaussians) == 0:
+        raise InputError(f"{path}: a .glb must hold at least one splat, got 0. Use .ply.")
+    gaussians = turned(storable(gaussians, path), LEFT_UP_FORWARD)
+    attributes = list(_attributes(gaussians))
+    text = json.dumps(_document(attributes, gaussians), separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = sum(tensor.numel() * tensor.element_size() for _, tensor in attributes)
+    total = HEADER.size + 2 * CHUNK.size + len(text) + length
+    if total > _MAX_SIZE:
+        raise InputError(f"{path}: a .glb holds {_MAX_SIZE} bytes, got {total}. Use .spz, or lower the SH degree.")
+    with replacing(path) as file:
+        file.write(HEADER.pack(MAGIC, 2, total))
+        file.write(CHUNK.pack(len(text), JSON) + text)
+        file.write(CHUNK.pack(length, BINARY))
+        for _, tensor in attributes:
+            file.write(np.ascontiguousarray(tensor.numpy()).data)
+
+
+def _attributes(gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
+    """(semantic, values [N, components]); every element is 4 bytes or a multiple, so nothing needs padding."""
+    rgba = torch.cat([sh.rgb_from_sh0(gaussians.sh0[:, 0]), gaussians.opacities[:, None]], dim=1)
+    yield "POSITION", gaussians.means
+    yield "COLOR_0", to_bytes(rgba * 255)
+    yield f"{EXTENSION}:ROTATION", normalize(gaussians.quats.double()).float()[:, [1, 2, 3, 0]]
+    yield f"{EXTENSION}:SCALE", scales(gaussians.log_scales)
+    yield f"{EXTENSION}:OPACITY", gaussians.opacities[:, None]
+    yield f"{EXTENSION}:SH_DEGREE_0_COEF_0", gaussians.sh0[:, 0]
+    for degree in range(1, gaussians.sh_degree + 1):
+        for order in range(2 * degree + 1):
+            yield f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}", gaussians.shN[:, degree**2 - 1 + order]
+
+
+def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dict[str, object]:
+    views, accessors, offset = [], [], 0
+    for name, tensor in attributes:
+        size = tensor.numel() * tensor.element_size()
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, "target": 34962})
+        is_byte = tensor.dtype == torch.uint8
+        accessor: dict[str, object] = {
+            "bufferView": len(accessors),
+            "componentType": _BYTE if is_byte else _FLOAT,
+            "count": len(tensor),
+            "type": _TYPES[tensor.shape[1]],
+        }
+        if is_byte:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor |= {"min": tensor.amin(dim=0).tolist(), "max": tensor.amax(dim=0).tolist()}
+        accessors.append(accessor)
+        offset += size
+    primitive = {
+        "mode": 0,
+        "attributes": {name: i for i, (name, _) in enumerate(attributes)},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": f"gsopt {gsopt.__version__}"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+
+
+def load_glb(path: Path) -> Gaussians:
+    """Read every primitive of splats, one after the other, padded to the highest SH degree among them.
+
+    Refused with InputError: other color spaces and kernels, compression, sparse or shared accessors, files that are
+    not self-contained, and nodes that move the splats.
+    """
+    with opened(path) as (file, size):
+        document = read_container(file, size, path)
+        parts = [_read(file, primitive, document) for primitive in splat_primitives(document)]
+    degree = max(part.sh_degree for part in parts)
+    parts = [part.with_sh_degree(degree) for part in parts]
+    joined = Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name, _ in parts[0].items()})
+    return checked(turned(joined, LEFT_UP_FORWARD), path)
+
+
+def _read(file: BinaryIO, primitive: dict[str, Accessor], document: Document) -> Gaussians:
+    count = primitive["POSITION"].count if "POSITION" in primitive else 0
+
+    def values(name: str, components: int) -> Tensor:
+        accessor = primitive.get(name)
+        if accessor is None or (accessor.count, accessor.components) != (count, components):
+            got = "nothing" if accessor is None else f"{accessor.count} times {accessor.components}"
+            document.fail(f"{name} must have {count} times {components} values, got {got}")
+        return torch.from_numpy(accessor.read(file, document))
+
+    def coefficients(degree: int) -> list[Tensor]:
+        return [values(f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}", 3) for i in range(2 * degree + 1)]
+
+    scale, opacity = values(f"{EXTENSION}:SCALE", 3), values(f"{EXTENSION}:OPACITY", 1)[:, 0]
+    if bool((scale < 0).any()):
+        document.fail("a scale is negative: the file follows an early draft of the extension, with logarithms")
+    if bool(((opacity < 0) | (opacity > 1)).any()):
+        document.fail("opacities must lie in [0, 1]")
+    degrees = [d for d in range(1, MAX_SH_DEGREE + 1) if any(f":SH_DEGREE_{d}_" in name for name in primitive)]
+    bands = [band for degree in range(1, max(degrees, default=0) + 1) for band in coefficients(degree)]
+    return Gaussians(
+        means=values("POSITION", 3),
+        quats=values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        log_scales=log_scales(scale),
+        logit_opacities=logit(opacity, _OPACITY_MARGIN),
+        sh0=torch.stack(coefficients(0), dim=1),
+        shN=torch.stack(bands, dim=1) if bands else torch.empty(count, 0, 3),
+    )

@@ -1,0 +1,96 @@
+"""Unpacking compressed streams that are not trusted: never more bytes than the caller asks for."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from gsopt._optional import require
+from gsopt.errors import InputError
+from gsopt.formats.files import read_exactly
+
+_PIECE = 1 << 16
+_GZIP_WINDOW = 16 + zlib.MAX_WBITS
+_SMALL = 1 << 26
+"""Bytes that may always be unpacked (64 MiB)."""
+_MAX_RATIO = 50
+"""Beyond 64 MiB, a file may unpack to this many times its size; real splats reach about 5."""
+
+
+def check_ratio(unpacked: int, packed: int, path: Path) -> None:
+    """InputError when `unpacked` bytes out of a file of `packed` bytes can only be an attack or damage."""
+    if unpacked > max(_SMALL, _MAX_RATIO * packed):
+        raise InputError(
+            f"{path} claims to unpack from {packed} to {unpacked} bytes, {_MAX_RATIO} times its size is the limit. "
+            "It is damaged or hostile: export it again."
+        )
+
+
+class GzipStream:
+    """A gzip stream taken apart piece by piece."""
+
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        self._file, self._path = file, path
+        self._zlib = zlib.decompressobj(_GZIP_WINDOW)
+        self._pending = b""
+
+    def take(self, count: int) -> bytes:
+        """Exactly `count` unpacked bytes, or InputError where the stream is damaged or ends before."""
+        out = bytearray()
+        while len(out) < count:
+            if self._zlib.eof:
+                missing = count - len(out)
+                raise InputError(f"{self._path} ends {missing} bytes before its last splat. Copy or export it again.")
+            out += self._step(count - len(out))
+        return bytes(out)
+
+    def finish(self) -> None:
+        """Read to the end, where gzip's checksum is compared; InputError when it differs or more data follows."""
+        while not self._zlib.eof:
+            if self._step(1):
+                raise InputError(f"{self._path} holds more than its header says. Export it again.")
+
+    def _step(self, limit: int) -> bytes:
+        self._pending = self._pending or self._file.read(_PIECE)
+        if not self._pending:
+            raise InputError(f"{self._path} was cut short. Copy or export it again.")
+        try:
+            piece = self._zlib.decompress(self._pending, limit)
+        except zlib.error as error:
+            raise InputError(f"{self._path} is damaged: {error}. Copy or export it again.") from error
+        self._pending = self._zlib.unconsumed_tail
+        return piece
+
+
+def deflated(parts: Iterable[bytes]) -> Iterator[bytes]:
+    """The parts as one gzip stream, without a time stamp: same splats, same bytes."""
+    packer = zlib.compressobj(6, zlib.DEFLATED, _GZIP_WINDOW)
+    for part in parts:
+        yield packer.compress(part)
+    yield packer.flush()
+
+
+def unzstd(file: BinaryIO, sizes: tuple[int, int], count: int, file_size: int, path: Path) -> bytes:
+    """The next Zstandard stream: `sizes` = (packed, plain) as claimed, `count` the plain size it must have."""
+    packed, plain = sizes
+    if plain != count or packed > file_size:
+        raise InputError(f"{path} claims a stream of {packed} to {plain} bytes, {count} needed. Export it again.")
+    check_ratio(plain, file_size, path)
+    zstandard = require("zstandard", "spz", "Reading .spz version 4")
+    data = read_exactly(file, packed, path, "a stream")
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as reader:
+            out = bytes(reader.read(count + 1))
+    except zstandard.ZstdError as error:
+        raise InputError(f"{path} is damaged: {error}. Copy or export it again.") from error
+    if len(out) != count:
+        raise InputError(f"{path}: a stream must unpack to {count} bytes, got {len(out)}. Copy or export it again.")
+    return out
+
+
+def zstandard_compressed(data: bytes) -> bytes:
+    """`data` as one Zstandard frame with its size and checksum."""
+    zstandard = require("zstandard", "spz", "Writing .spz version 4")
+    return bytes(zstandard.ZstdCompressor(level=3, write_checksum=True).compress(data))
