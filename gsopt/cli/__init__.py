@@ -1,0 +1,89 @@
+"""The command line: `gsopt VERB ...`, one module per verb. Importing this costs nothing; a verb loads what it needs."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from gsopt import __version__
+from gsopt.errors import GsoptError, UsageError
+
+VERBS = {
+    "train": "learn Gaussians from posed images",
+    "render": "draw a finished run as images or a video",
+    "eval": "judge a finished run by its held-out views",
+    "export": "write splats in another format",
+    "view": "look at a run or a splat file in the browser",
+    "demo": "train on the small scene that ships with gsopt",
+    "doctor": "say what is installed, what is missing and how fast this machine is",
+}
+
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code: 0, a GsoptError's `exit_code`, or 130 when interrupted."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    first = arguments[0] if arguments else ""
+    if first in ("-h", "--help"):
+        print(usage())
+        return 0
+    if first == "--version":
+        print(f"gsopt {__version__}")
+        return 0
+    try:
+        return run_verb(first, arguments[1:])
+    except GsoptError as error:
+        print(f"gsopt: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("gsopt: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # `gsopt ... | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def run_verb(verb: str, arguments: Sequence[str]) -> int:
+    """Load the verb's module and run its `main`; UsageError for a verb that does not exist."""
+    if verb not in VERBS:
+        raise UsageError(unknown_verb(verb))
+    module = importlib.import_module(f"gsopt.cli.{verb}")
+    try:
+        code: int = module.main(arguments)
+    except SystemExit as stop:  # how argument parsers leave after --help or a wrong flag
+        return exit_code(stop)
+    return code
+
+
+def exit_code(stop: SystemExit) -> int:
+    """What the interpreter would answer with: 0 for None, the number, or 1 after printing a text."""
+    if isinstance(stop.code, str):
+        print(stop.code, file=sys.stderr)
+        return 1
+    return stop.code or 0
+
+
+def unknown_verb(verb: str) -> str:
+    """What was wrong, what was got and the verbs that come closest."""
+    if not verb:
+        return f"A verb is needed, got none. Give one of {', '.join(VERBS)}; `gsopt --help` explains them."
+    close = difflib.get_close_matches(verb, VERBS, n=2, cutoff=0.5)
+    advice = f"Did you mean {' or '.join(close)}?" if close else f"Give one of {', '.join(VERBS)}."
+    return f"Unknown verb, got {verb!r}. {advice}"
+
+
+def usage() -> str:
+    """The text of `gsopt --help`."""
+    width = max(map(len, VERBS))
+    verbs = "\n".join(f"  {verb:<{width}}  {purpose}" for verb, purpose in VERBS.items())
+    return (
+        "usage: gsopt VERB [flags]\n\n"
+        "3D Gaussian Splatting from few images.\n\n"
+        f"verbs:\n{verbs}\n\n"
+        "`gsopt VERB --help` explains a verb's flags; `gsopt --version` prints the version.\n"
+        "exit codes: 0 done, 2 wrong flag or missing package, 3 unusable input, 4 numerical failure, 130 interrupted."
+    )
