@@ -1,0 +1,41 @@
+"""The public names: few, pinned, loadable and documented."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+import gsopt
+
+PUBLIC = {
+    "Cameras",
+    "Gaussians",
+    "GsoptError",
+    "RasterSettings",
+    "Scene",
+    "TrainConfig",
+    "evaluate",
+    "load_scene",
+    "load_splats",
+    "rasterize",
+    "save_splats",
+    "train",
+}
+
+
+def test_the_surface_is_what_was_agreed_and_small() -> None:
+    assert set(gsopt.__all__) == PUBLIC == set(dir(gsopt))
+    assert len(PUBLIC) <= 15
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_a_public_name_loads_and_says_what_it_is(name: str) -> None:
+    thing = getattr(gsopt, name)
+    assert thing.__name__ == name
+    assert inspect.getdoc(thing)
+
+
+def test_another_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'rasterise'"):
+        gsopt.rasterise  # noqa: B018 - the access is the test
