@@ -86,3 +86,19 @@ def load_splats(path: str | PathLike[str]) -> Gaussians:
             from gsopt.formats.compressed_ply import load_any_ply
 
             return load_any_ply(path)
+
+
+def is_antialiased(path: str | PathLike[str]) -> bool:
+    """Whether a file says that its splats want the 2D filter of Mip-Splatting; False for formats that cannot say it."""
+    path = Path(path)
+    match suffix_of(path):
+        case ".ply":
+            from gsopt.formats.ply import ply_antialiased
+
+            return ply_antialiased(path)
+        case ".spz":
+            from gsopt.formats.spz import spz_antialiased
+
+            return spz_antialiased(path)
+        case _:
+            return False

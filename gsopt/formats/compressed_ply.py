@@ -116,7 +116,7 @@ def _split(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.float6
     columns = []
     for width in reversed(bits):
         columns.append((word & ((1 << width) - 1)) / ((1 << width) - 1))
-        word = word >> width
+        word = word >> np.uint32(width)
     return np.stack(columns[::-1], axis=1)
 
 

@@ -73,7 +73,9 @@ def _attributes(gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
 
 
 def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dict[str, object]:
-    views, accessors, offset = [], [], 0
+    views: list[dict[str, object]] = []
+    accessors: list[dict[str, object]] = []
+    offset = 0
     for name, tensor in attributes:
         size = tensor.numel() * tensor.element_size()
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, "target": 34962})

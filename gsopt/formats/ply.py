@@ -20,16 +20,16 @@ from gsopt.errors import InputError
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import BLOCK, float_blocks, seek_element
-from gsopt.formats.rows import MAX_SH_DEGREE, checked, storable
-from gsopt.gaussians import Gaussians
+from gsopt.formats.rows import BANDS, MAX_SH_DEGREE, checked, storable
+from gsopt.gaussians import PARAMETERS, Gaussians
 
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-_BANDS = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
-"""Number of f_rest properties -> K - 1."""
+_SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh0": (1, 3)}
+"""Of one row; that of shN depends on the degree."""
 
 
 def save_ply(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
@@ -72,56 +72,44 @@ def _interleave(gaussians: Gaussians, rows: slice) -> NDArray[np.float32]:
     return block
 
 
-def load_ply(path: Path) -> Gaussians:
-    """Read an Inria PLY of SH degree 0 to 3: any order of properties, any scalar type, ascii or binary.
-
-    Properties that no splat needs are ignored. Raises InputError for a file that is damaged, cut short or no splat.
-    """
-    with opened(path) as (file, size):
-        return read_splats(file, read_header(file, path), size, path)
+def ply_antialiased(path: Path) -> bool:
+    """Whether the header says that its splats were optimised with the 2D filter of Mip-Splatting."""
+    with opened(path) as (file, _):
+        comments = [comment.lower() for comment in read_header(file, path).comments]
+    return "splatrendermode: mip" in comments or "antialiased 1" in comments
 
 
 def read_splats(file: BinaryIO, header: Header, file_size: int, path: Path) -> Gaussians:
-    """Read the element `vertex` of a PLY whose header was just read from `file`."""
+    """Read the element `vertex` of an Inria PLY of SH degree 0 to 3 whose header was just read from `file`.
+
+    Any order of properties, any scalar type, ascii or binary; properties that no splat needs are ignored. Raises
+    InputError for a file that is damaged, cut short or no splat.
+    """
     vertex = header.element("vertex")
     if vertex is None:
         got = ", ".join(element.name for element in header.elements)[:80] or "none"
         raise InputError(f"{path} needs an element `vertex`, got {got}. It holds no splats: check the path.")
     bands = _bands(vertex, path)
     seek_element(file, header, vertex, file_size, path)
-    n = vertex.count
-    rest = tuple(f"f_rest_{i}" for i in range(3 * bands))
-    take = {name: _take(vertex, names) for name, names in _columns(rest).items()}
-    out = {
-        "means": np.empty((n, 3), np.float32),
-        "quats": np.empty((n, 4), np.float32),
-        "log_scales": np.empty((n, 3), np.float32),
-        "logit_opacities": np.empty((n, 1), np.float32),
-        "sh0": np.empty((n, 3), np.float32),
-        "shN": np.empty((n, bands, 3), np.float32),
-    }
+    take = {name: _take(vertex, names) for name, names in _columns(bands).items()}
+    out = {name: torch.empty(vertex.count, *_SHAPES.get(name, (bands, 3))) for name in take}
     start = 0
     for block in float_blocks(file, header, vertex, path):
         rows = slice(start, start + len(block))
-        for name, target in out.items():
-            values = block[:, take[name]]
-            target[rows] = values.reshape(len(values), 3, bands).transpose(0, 2, 1) if name == "shN" else values
+        for name, columns in take.items():
+            values = block[:, columns]
+            if name == "shN":
+                values = values.reshape(len(values), 3, bands).transpose(0, 2, 1)
+            target = out[name][rows].numpy()
+            target[...] = values.reshape(target.shape)
         start += len(block)
-    tensors = {name: torch.from_numpy(array) for name, array in out.items()}
-    tensors["logit_opacities"] = tensors["logit_opacities"].squeeze(1)
-    tensors["sh0"] = tensors["sh0"].unsqueeze(1)
-    return checked(Gaussians(**tensors), path)
+    return checked(Gaussians(**out), path)
 
 
-def _columns(rest: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    return {
-        "means": _MEANS,
-        "quats": _QUATS,
-        "log_scales": _SCALES,
-        "logit_opacities": ("opacity",),
-        "sh0": _SH0,
-        "shN": rest,
-    }
+def _columns(bands: int) -> dict[str, tuple[str, ...]]:
+    rest = tuple(f"f_rest_{i}" for i in range(3 * bands))
+    names = (_MEANS, _QUATS, _SCALES, ("opacity",), _SH0, rest)
+    return dict(zip(PARAMETERS, names, strict=True))
 
 
 def _take(vertex: Element, names: tuple[str, ...]) -> slice | list[int]:
@@ -142,9 +130,10 @@ def _bands(vertex: Element, path: Path) -> int:
             "It is a mesh or a point cloud, not splats: choose a file written by a splat trainer."
         )
     rest = {name for name in vertex.names if name.startswith("f_rest_")}
-    if len(rest) not in _BANDS or rest != {f"f_rest_{i}" for i in range(len(rest))}:
+    bands = len(rest) // 3
+    if len(rest) != 3 * bands or bands not in BANDS or rest != {f"f_rest_{i}" for i in range(len(rest))}:
         raise InputError(
-            f"{path} must have f_rest_0 to f_rest_(m-1) with m one of {', '.join(map(str, _BANDS))} "
+            f"{path} must have f_rest_0 to f_rest_(m-1) with m one of {[3 * k for k in BANDS]} "
             f"(SH degree 0 to {MAX_SH_DEGREE}), got {len(rest)} of them. Export it with one of these degrees."
         )
-    return _BANDS[len(rest)]
+    return bands

@@ -11,6 +11,8 @@ from gsopt.errors import InputError
 from gsopt.gaussians import Gaussians
 
 MAX_SH_DEGREE = 3
+BANDS = (0, 3, 8, 15)
+"""K - 1 for SH degree 0 to 3."""
 _XYZ = "xyz"
 _TINY = torch.finfo(torch.float32).tiny
 _MAX_LOG = 87.0
@@ -29,30 +31,30 @@ def checked(gaussians: Gaussians, path: Path, consequence: str = "Remove or repa
     """The same record, or InputError naming path, property and row of what is not finite or not a rotation."""
     _check_shapes(gaussians, path)
     for name, tensor in gaussians.items():
-        # A sum is finite unless an element is not (or it overflows, which the slow look below settles).
+        # A sum is finite unless an element is not, or it overflows, which the slow look at every element settles.
         if tensor.numel() and not bool(torch.isfinite(tensor.sum())) and not bool(torch.isfinite(tensor).all()):
-            index = torch.nonzero(~torch.isfinite(tensor))[0].tolist()
-            got = tensor[tuple(index)].item()
-            column = ply_name(name, index[1:], gaussians.shN.shape[1])
-            raise InputError(f"{path}: `{column}` of row {index[0]} must be finite, got {got}. {consequence}")
+            row, *column = torch.nonzero(~torch.isfinite(tensor))[0].tolist()
+            where = f"`{ply_name(name, column, gaussians.shN.shape[1])}` of row {row}"
+            raise InputError(f"{path}: {where} must be finite, got {tensor[(row, *column)].item()}. {consequence}")
     length2 = gaussians.quats.square().sum(dim=1)
-    if len(gaussians) and not bool(((length2 >= _TINY) & torch.isfinite(length2)).all()):
-        row = int(torch.nonzero(~((length2 >= _TINY) & torch.isfinite(length2)))[0])
-        got = gaussians.quats[row].tolist()
-        raise InputError(f"{path}: the rotation of row {row} must have a usable length, got {got}. {consequence}")
+    unusable = ~((length2 >= _TINY) & torch.isfinite(length2))
+    if bool(unusable.any()):
+        row = int(torch.nonzero(unusable)[0])
+        got = ", ".join(f"{value:g}" for value in gaussians.quats[row].tolist())
+        raise InputError(f"{path}: the rotation (rot_0..3) of row {row} has no usable length, got {got}. {consequence}")
     return gaussians
 
 
 def _check_shapes(gaussians: Gaussians, path: Path) -> None:
-    n, degree = len(gaussians), gaussians.sh_degree
-    if degree > MAX_SH_DEGREE:
-        raise InputError(f"{path}: SH degree must be 0 to {MAX_SH_DEGREE}, got {degree}. Call with_sh_degree(3) first.")
-    expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
-    expected |= {"sh0": (n, 1, 3), "shN": (n, (degree + 1) ** 2 - 1, 3)}
+    n, bands = len(gaussians), gaussians.shN.shape[1] if gaussians.shN.ndim == 3 else 0
+    expected: dict[str, list[int]] = {"means": [n, 3], "quats": [n, 4], "log_scales": [n, 3], "logit_opacities": [n]}
+    expected |= {"sh0": [n, 1, 3], "shN": [n, bands, 3]}
     for name, tensor in gaussians.items():
-        if tuple(tensor.shape) != expected[name]:
-            want, got = list(expected[name]), list(tensor.shape)
-            raise InputError(f"{path}: `{name}` must have shape {want}, got {got}. Give one row per splat.")
+        if list(tensor.shape) != expected[name]:
+            got = list(tensor.shape)
+            raise InputError(f"{path}: `{name}` must have shape {expected[name]}, got {got}. Give one row per splat.")
+    if bands not in BANDS:
+        raise InputError(f"{path}: `shN` must have {BANDS} bands (SH degree 0-3), got {bands}. Call with_sh_degree(3).")
 
 
 def ply_name(parameter: str, index: list[int], bands: int) -> str:

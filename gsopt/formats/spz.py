@@ -80,16 +80,29 @@ def load_spz(path: Path) -> Gaussians:
     is refused before it is unpacked.
     """
     with opened(path) as (file, size):
-        start = file.read(4)
-        file.seek(0)
-        if start[:2] == _GZIP:
-            header, streams = _read_gzip(file, size, path)
-        elif start == _MAGIC:
-            header, streams = _read_zstandard(file, size, path)
-        else:
-            raise InputError(f"{path} must begin as gzip or with `NGSP`, got {start!r}. It is no .spz: check the path.")
+        read = _read_gzip if _is_gzip(file, path) else _read_zstandard
+        header, streams = read(file, size, path)
     gaussians = unpack(streams, header.count, header.sh_degree, header.version, header.fraction_bits)
     return checked(turned(gaussians, RIGHT_UP_BACK), path)
+
+
+def spz_antialiased(path: Path) -> bool:
+    """Whether the file says that its splats were optimised with the 2D filter of Mip-Splatting."""
+    with opened(path) as (file, _):
+        if _is_gzip(file, path):
+            data = GzipStream(file, path).take(_HEADER.size)
+        else:
+            data = read_exactly(file, _HEADER.size, path, "its header")
+        return bool(_parse(data, path, (2, 3, 4)).flags & _ANTIALIASED)
+
+
+def _is_gzip(file: BinaryIO, path: Path) -> bool:
+    """True for versions 2 and 3, False for 4, InputError for anything else; the position stays at the start."""
+    start = file.read(4)
+    file.seek(0)
+    if start[:2] != _GZIP and start != _MAGIC:
+        raise InputError(f"{path} must begin as gzip or with `NGSP`, got {start!r}. It is no .spz: check the path.")
+    return start[:2] == _GZIP
 
 
 def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes]]:

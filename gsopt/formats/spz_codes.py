@@ -46,7 +46,7 @@ def pack(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
         _pack_smallest_three(gaussians.quats),
         _pack_bands(gaussians.shN),
     ]
-    return fraction_bits, [stream.tobytes() if isinstance(stream, np.ndarray) else _raw(stream) for stream in streams]
+    return fraction_bits, [np.asarray(stream).tobytes() for stream in streams]
 
 
 def unpack(streams: Sequence[bytes], count: int, sh_degree: int, version: int, fraction_bits: int) -> Gaussians:
@@ -61,10 +61,6 @@ def unpack(streams: Sequence[bytes], count: int, sh_degree: int, version: int, f
         sh0=((_floats(colors) / 255 - 0.5) / _COLOR_SCALE).reshape(count, 1, 3),
         shN=((_floats(bands) - 128) / 128).reshape(count, (sh_degree + 1) ** 2 - 1, 3),
     )
-
-
-def _raw(stream: Tensor) -> bytes:
-    return stream.numpy().tobytes()
 
 
 def _floats(codes: NDArray[np.uint8]) -> Tensor:
