@@ -8,7 +8,7 @@ TEST_EXTRAS := dev,viewer,video
 
 VENV := .venv
 PY := $(VENV)/bin/python
-PIP := $(PY) -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+PIP := $(PY) -m pip --disable-pip-version-check install -qq --constraint constraints.txt
 # The build tools are pinned too, which an isolated build would not heed.
 INSTALL := $(PIP) --no-build-isolation --editable
 SOURCES := pyproject.toml constraints.txt \
@@ -31,6 +31,7 @@ lint: $(VENV)/.for-test
 	$(VENV)/bin/lint-imports
 
 $(VENV)/.build-tools: constraints.txt
+	@echo "Installing into $(VENV); the first time takes a few minutes."
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PIP) scikit-build-core nanobind cmake ninja
 	touch $@

@@ -150,15 +150,15 @@ def measure(backend: Backend) -> float:
     return round(1000 * statistics.median(times), 2)
 
 
-def find_lpips_vgg() -> str | None:
-    """Where the weights of LPIPS (VGG) are, or None; a wrong setting is reported in place of a path."""
+def find_lpips_vgg() -> dict[str, str | None]:
+    """Where the weights of LPIPS (VGG) are, or why there are none."""
     try:
-        from gsopt.metrics import find_vgg_weights
+        from gsopt.metrics import VGG_NOTE, find_vgg_weights
 
         path = find_vgg_weights()
     except (GsoptError, ImportError) as error:
-        return f"problem: {error}"
-    return None if path is None else str(path)
+        return {"path": None, "problem": str(error)}
+    return {"path": None, "problem": VGG_NOTE} if path is None else {"path": str(path), "problem": None}
 
 
 def text(findings: dict[str, Any]) -> str:
@@ -170,7 +170,7 @@ def text(findings: dict[str, Any]) -> str:
         extra = f" [{package['extra']}]" if package["extra"] else ""
         lines.append(f"  {package['name'] + extra:<24} {package['version'] or 'not installed'}")
     lines += ["", "rasteriser", *rasterizer_lines(findings["rasterizer"]), "", "LPIPS (VGG) weights"]
-    lines.append(f"  {findings['lpips_vgg'] or 'not found: LPIPS (VGG) is left out of metrics'}")
+    lines.append(f"  {findings['lpips_vgg']['path'] or findings['lpips_vgg']['problem']}")
     if findings["missing_extras"]:
         lines += ["", "to install what is missing"]
         lines += [f"  {line}" for line in findings["missing_extras"].values()]
