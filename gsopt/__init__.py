@@ -17,7 +17,7 @@ _HOME = {
     "RasterSettings": "gsopt.raster.backend",
     "Scene": "gsopt.data.scene",
     "TrainConfig": "gsopt.config",
-    "evaluate": "gsopt.evaluate",
+    "evaluate": "gsopt.evaluation",
     "load_scene": "gsopt.data.scene",
     "load_splats": "gsopt.formats",
     "rasterize": "gsopt.raster.api",
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from gsopt.config import TrainConfig
     from gsopt.data.scene import Scene, load_scene
     from gsopt.errors import GsoptError
-    from gsopt.evaluate import evaluate
+    from gsopt.evaluation import evaluate
     from gsopt.formats import load_splats, save_splats
     from gsopt.gaussians import Gaussians
     from gsopt.raster.api import rasterize

@@ -1,0 +1,129 @@
+"""Pictures to files: PNG frames in a folder, or a film as MP4, WebP or GIF."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import BinaryIO
+
+from jaxtyping import UInt8
+from PIL import Image
+from torch import Tensor
+
+from gsopt import check
+from gsopt._optional import require
+from gsopt.errors import InputError, UsageError
+from gsopt.formats.files import replacing
+
+FILMS = (".mp4", ".webp", ".gif")
+WEBP_QUALITY = 85
+LARGEST_SIDE = {".webp": 16383, ".gif": 65535, ".mp4": 8192}
+"""What the formats (WebP, GIF) or common decoders (H.264) can hold, px."""
+
+
+def save_film(output: Path, pictures: Iterable[UInt8[Tensor, "H W 3"]], fps: float, *, overwrite: bool = False) -> None:
+    """Write a film whose format the suffix of `output` names; whole file or nothing.
+
+    Raises UsageError when the file exists and `overwrite` is not set, InputError for pictures of different sizes,
+    MissingDependency when MP4 is asked for without the package `av`.
+    """
+    kind = output.suffix.lower()
+    check.one_of("suffix of --output", kind, FILMS)
+    check.within("--fps", fps, 0.1, 240, "24 is usual.")
+    if output.exists() and not overwrite:
+        raise UsageError(f"{output} exists already. Add --overwrite to replace it, or name another file.")
+    if kind == ".mp4":
+        require("av", "video", "Writing an MP4 film")
+    images = _same_size(pictures, LARGEST_SIDE[kind])
+    first = next(images)
+    with replacing(output) as file:
+        write_film(file, itertools.chain([first], images), kind, fps)
+
+
+def write_film(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: float) -> None:
+    """Encode images of one size into an open, seekable file."""
+    if kind == ".mp4":
+        _write_mp4(file, images, fps)
+        return
+    first = next(images)
+    # GIF counts in hundredths of a second, and players slow down what is shorter than two of them.
+    duration = round(1000 / fps) if kind == ".webp" else max(20, 10 * round(100 / fps))
+    options = {"quality": WEBP_QUALITY, "method": 4} if kind == ".webp" else {"optimize": False}
+    first.save(
+        file,
+        format=kind[1:].upper(),
+        save_all=True,
+        append_images=images,
+        duration=duration,
+        loop=0,
+        **options,
+    )
+
+
+def _write_mp4(file: BinaryIO, images: Iterator[Image.Image], fps: float) -> None:
+    av = require("av", "video", "Writing an MP4 film")
+    with av.open(file, "w", format="mp4") as container:
+        stream = None
+        for image in images:
+            # 4:2:0 chroma has one sample for two rows and columns: an odd last one is cut off.
+            image = image.crop((0, 0, max(2, image.width // 2 * 2), max(2, image.height // 2 * 2)))
+            if stream is None:
+                rate = Fraction(fps).limit_denominator(1000)
+                stream = container.add_stream("libx264", rate=rate, options={"crf": "18"})
+                stream.width, stream.height, stream.pix_fmt = image.width, image.height, "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_image(image)))
+        if stream is not None:
+            container.mux(stream.encode())
+
+
+def save_stills(
+    folder: Path, pictures: Iterable[tuple[str, UInt8[Tensor, "H W 3"]]], *, overwrite: bool = False
+) -> list[Path]:
+    """Write each picture as FOLDER/NAME.png and return the paths. The names must be safe (see `safe_name`).
+
+    Raises UsageError before writing over a file, unless `overwrite` is set; InputError when the disk refuses.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"Cannot make the folder {folder}: {error.strerror}. Choose another one.") from error
+    written: list[Path] = []
+    for name, picture in pictures:
+        path = folder / f"{name}.png"
+        if path.exists() and not overwrite:
+            raise UsageError(f"{path} exists already. Add --overwrite to replace it, or name another folder.")
+        with replacing(path) as file:
+            as_image(picture).save(file, format="PNG")
+        written.append(path)
+    return written
+
+
+def safe_name(index: int, name: str) -> str:
+    """A file name that sorts by index, keeps what is harmless of a view's name and never leads out of a folder."""
+    stem = Path(name.replace("\\", "/")).stem
+    harmless = "".join(letter if letter.isascii() and (letter.isalnum() or letter in "-_") else "_" for letter in stem)
+    return f"{index:04d}_{harmless[:60]}"
+
+
+def as_image(picture: UInt8[Tensor, "H W 3"]) -> Image.Image:
+    return Image.fromarray(picture.contiguous().numpy())
+
+
+def _same_size(pictures: Iterable[Tensor], largest: int) -> Iterator[Image.Image]:
+    """Images one by one; InputError at the first of another size, or when there is none."""
+    size: tuple[int, int] | None = None
+    for picture in pictures:
+        image = as_image(picture)
+        size = size or image.size
+        if image.size != size:
+            got = f"{image.width}x{image.height} after {size[0]}x{size[1]}"
+            raise InputError(f"All frames of a film must have one size, got {got}. Write PNG frames instead.")
+        if max(size) > largest:
+            raise InputError(
+                f"This format holds at most {largest} px a side, got {max(size)}. Write PNG frames instead."
+            )
+        yield image
+    if size is None:
+        raise InputError("A film needs at least one frame, got none. Give a path with cameras on it.")
