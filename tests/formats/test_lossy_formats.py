@@ -1,0 +1,164 @@
+"""What a quantised format loses stays inside the bounds that its writer's docstring states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from splat_samples import errors, make_splats, same_bits
+
+from gsopt.errors import InputError
+from gsopt.formats import load_splats, save_splats
+from gsopt.formats.compressed_ply import CHUNK
+from gsopt.formats.morton import morton_order
+from gsopt.gaussians import Gaussians
+
+BYTE = 0.5 / 255 + 1e-6
+C0 = 0.28209479177387814
+
+
+def round_trip(path: Path, splats: Gaussians) -> Gaussians:
+    save_splats(path, splats)
+    return load_splats(path)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_splat_loses_what_it_says(tmp_path: Path, degree: int) -> None:
+    splats = make_splats(degree=degree)
+    back = round_trip(tmp_path / "a.splat", splats)
+    assert back.sh_degree == 0
+    lost = errors(splats.with_sh_degree(0), back)
+    assert lost.means == 0
+    assert lost.log_scales < 1e-5
+    assert lost.opacities <= BYTE
+    assert lost.sh0 <= BYTE / C0
+    assert lost.quats <= 1 / 128
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_spz_loses_what_it_says(tmp_path: Path, degree: int) -> None:
+    splats = make_splats(degree=degree)
+    back = round_trip(tmp_path / "a.spz", splats)
+    lost = errors(splats, back)
+    assert lost.means <= 2**-17
+    assert lost.log_scales <= 1 / 32 + 1e-6
+    assert lost.opacities <= BYTE
+    assert lost.sh0 <= 0.0131
+    assert lost.sh1 <= 0.036
+    assert lost.sh_rest <= 0.067
+    assert lost.quats <= 0.0022
+
+
+@pytest.mark.parametrize(("extent", "bits"), [(1, 16), (127, 16), (129, 15), (2047, 12), (8e6, 0)])
+def test_spz_gives_large_scenes_fewer_fraction_bits(tmp_path: Path, extent: float, bits: int) -> None:
+    splats = make_splats()
+    splats.means[:] *= extent / splats.means.abs().max()
+    assert errors(splats, round_trip(tmp_path / "a.spz", splats)).means <= 0.5 * 2.0**-bits
+
+
+def test_spz_refuses_what_24_bits_cannot_hold(tmp_path: Path) -> None:
+    splats = make_splats()
+    splats.means[7, 1] = 1e7
+    with pytest.raises(InputError, match="coordinates"):
+        save_splats(tmp_path / "a.spz", splats)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_compressed_ply_loses_what_it_says(tmp_path: Path, degree: int) -> None:
+    splats = make_splats(count=700, degree=degree)
+    back = round_trip(tmp_path / "a.compressed.ply", splats)
+    splats = splats.select(torch.from_numpy(morton_order(splats.means.numpy())))
+    for start in range(0, len(splats), CHUNK):
+        rows = torch.arange(start, min(start + CHUNK, len(splats)))
+        a, b = splats.select(rows), back.select(rows)
+        steps = torch.tensor([1 / 4094, 1 / 2046, 1 / 4094])
+        for name in ("means", "log_scales"):
+            x, y = getattr(a, name), getattr(b, name)
+            assert bool(((x - y).abs() <= (x.amax(0) - x.amin(0)) * steps + 2e-6).all())
+        extent = a.sh0.amax(0) - a.sh0.amin(0)
+        assert bool(((a.sh0 - b.sh0).abs() <= extent / 510 + 2e-6).all())
+        lost = errors(a, b)
+        assert lost.opacities <= BYTE
+        assert max(lost.sh1, lost.sh_rest) <= 1 / 64 + 1e-6
+        assert lost.quats <= 0.0021
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_glb_loses_only_roundings(tmp_path: Path, degree: int) -> None:
+    splats = make_splats(degree=degree)
+    lost = errors(splats, round_trip(tmp_path / "a.glb", splats))
+    assert (lost.means, lost.sh0, lost.sh1, lost.sh_rest) == (0, 0, 0, 0)
+    assert lost.log_scales <= 1e-5
+    assert lost.opacities <= 1e-7
+    assert lost.quats <= 2e-7
+
+
+def test_spz_of_what_spz_gave_is_the_same_file(tmp_path: Path) -> None:
+    once = round_trip(tmp_path / "a.spz", make_splats())
+    save_splats(tmp_path / "b.spz", once)
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
+
+
+def test_splat_of_what_splat_gave_differs_in_rotations_only(tmp_path: Path) -> None:
+    """Rotations are made unit again, which may move a byte; colors, opacities and scales are at rest."""
+    once = round_trip(tmp_path / "a.splat", make_splats())
+    twice = round_trip(tmp_path / "b.splat", once)
+    assert same_bits(replace(once, quats=twice.quats), twice)
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".compressed.ply", ".glb"])
+def test_extremes_stay_usable(tmp_path: Path, suffix: str) -> None:
+    """Values at the end of float32's range are clamped, never turned into something that is not finite."""
+    splats = make_splats(4)
+    splats.log_scales[0], splats.log_scales[1] = -1e30, 1e30
+    splats.logit_opacities[0], splats.logit_opacities[1] = -1e30, 1e30
+    splats.sh0[0], splats.sh0[1] = -1e30, 1e30
+    splats.shN[0], splats.shN[1] = -1e30, 1e30
+    splats.quats[0], splats.quats[1] = torch.tensor([1e-18, 0, 0, 0]), torch.tensor([0, 0, 1e18, 0])
+    back = round_trip(tmp_path / f"a{suffix}", splats)
+    order = torch.from_numpy(morton_order(splats.means.numpy())) if suffix == ".compressed.ply" else torch.arange(4)
+    faint, opaque = order.tolist().index(0), order.tolist().index(1)
+    assert back.opacities[faint] < 0.001
+    assert back.opacities[opaque] > 0.999
+    assert back.log_scales[faint].max() < -9
+    assert back.log_scales[opaque].min() > 5
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".spz"])
+def test_no_splats_come_back_as_no_splats(tmp_path: Path, suffix: str) -> None:
+    back = round_trip(tmp_path / f"a{suffix}", make_splats(0, degree=2))
+    assert len(back) == 0
+    assert back.sh_degree in (0, 2)
+
+
+def test_a_glb_of_no_splats_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least one"):
+        save_splats(tmp_path / "a.glb", make_splats(0))
+
+
+def test_morton_order_walks_the_octants_in_turn() -> None:
+    """All of an octant comes before any of the next, x deciding first, then y, then z; and so on inside."""
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3)).astype(np.float32)
+    points[:2] = [[-1, -1, -1], [1, 1, 1]]
+    order = morton_order(points)
+    assert sorted(order) == list(range(500))
+    octant = ((points > 0) @ [4, 2, 1])[order]
+    assert bool((np.diff(octant) >= 0).all())
+
+
+def test_morton_order_keeps_ties_and_bears_flat_clouds() -> None:
+    assert morton_order(np.zeros((5, 3), np.float32)).tolist() == [0, 1, 2, 3, 4]
+    line = np.array([[0, 3, 0], [0, 1, 0], [0, 2, 0]], np.float32)
+    assert morton_order(line).tolist() == [1, 2, 0]
+
+
+def test_plain_and_compressed_ply_are_told_apart_by_content(tmp_path: Path) -> None:
+    save_splats(tmp_path / "a.ply", make_splats(5))
+    save_splats(tmp_path / "b.compressed.ply", make_splats(5))
+    (tmp_path / "a.ply").rename(tmp_path / "c.compressed.ply")
+    (tmp_path / "b.compressed.ply").rename(tmp_path / "d.ply")
+    assert same_bits(load_splats(tmp_path / "c.compressed.ply"), make_splats(5))
+    assert len(load_splats(tmp_path / "d.ply")) == 5
