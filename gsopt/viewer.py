@@ -192,7 +192,9 @@ def frame_run(viewer: SplatViewer, gaussians: Gaussians, cameras: list[Cameras])
     eye = center + radius * torch.tensor([2.0, 2.0, 1.0])
     if cameras:
         viewer.show_cameras(cameras, radius)
-        eye = cameras[0].centers[0]
+        # Behind and above the first camera, so that its own frustum does not stand in the way.
+        first = cameras[0].centers[0].float()
+        eye = first + 0.25 * (first - center) + 0.25 * (first - center).norm() * mean_up(cameras).float()
     viewer.look_from(eye, center)
 
 
