@@ -1,0 +1,5 @@
+"""The first Gaussians: from sparse points, from silhouettes, or at random where the cameras look."""
+
+from gsopt.init.first import first_gaussians
+
+__all__ = ["first_gaussians"]

@@ -1,0 +1,219 @@
+"""The visual hull: the largest shape whose silhouettes agree with every input view (Laurentini 1994).
+
+Carved on voxels, coarse to fine, then sampled: points are placed at random in the voxels and kept where every
+silhouette holds them, so a point's accuracy is that of the masks and not of the voxels (GaussianObject, Yang et al.
+2024, starts from such points).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gsopt.data.scene import Scene
+from gsopt.init.photos import Photo, colors_from_sums, sample, small_photos
+from gsopt.init.rig import Focus, find_focus, inside, project
+
+SURFACE_SHARE = 0.7
+"""Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and
+what is carved away during training must find Gaussians behind it to take over."""
+MAX_PHOTOS = 100
+"""Silhouettes used at most; more hardly carve."""
+COARSE = 48
+"""Voxels along each side of the first grid."""
+_LOOKUPS = 6e7
+"""Voxels times views of the second grid: bounds its time."""
+_SIDE_LOW, _SIDE_HIGH = 48, 144
+_SOLID = 0.5
+"""Alpha above which a pixel belongs to the object."""
+_FULL = 0.98
+"""Silhouettes that cover more than this of all pixels outline nothing."""
+_ROUNDS = 24
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class HullPoints:
+    """Coloured points in the hull."""
+
+    xyz: Float[Tensor, "N 3"]
+    rgb: Float[Tensor, "N 3"]
+    silhouettes: int
+    voxel: float
+    """Edge of the finest voxels, scene units."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Voxels that may belong to the hull."""
+
+    occupied: Bool[Tensor, "X Y Z"]
+    low: Float[Tensor, "3"]
+    """Corner of voxel (0, 0, 0)."""
+    voxel: float
+
+    def centers(self, cells: Bool[Tensor, "X Y Z"]) -> Float[Tensor, "M 3"]:
+        return self.low + (torch.nonzero(cells) + 0.5) * self.voxel
+
+
+def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoints | None:
+    """`count` coloured points on and in the hull of the input views; None when the silhouettes enclose nothing."""
+    photos = small_photos(scene.train, MAX_PHOTOS)
+    covered = sum(float((photo.planes[3] > 127).double().mean()) for photo in photos) / len(photos)
+    if covered > _FULL:
+        return None
+    grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
+    if grid is None:
+        return None
+    xyz = _sample_points(grid, photos, count, generator)
+    if len(xyz) == 0:
+        return None
+    return HullPoints(xyz, unoccluded_colors(grid, photos, xyz), len(photos), grid.voxel)
+
+
+def carve(photos: list[Photo], focus: Focus) -> Grid | None:
+    """Find the object's box on a coarse grid, then carve a fine one inside it; None when nothing is left."""
+    half = 2 * focus.radius
+    coarse = _carved(photos, focus.point - half, torch.full((3,), 2 * half), COARSE, cautious=True)
+    if not bool(coarse.occupied.any()):
+        return None
+    cells = torch.nonzero(coarse.occupied)
+    low = coarse.low + (cells.amin(0) - 1) * coarse.voxel
+    size = (cells.amax(0) - cells.amin(0) + 3) * coarse.voxel
+    side = int(min(max((_LOOKUPS / len(photos)) ** (1 / 3), _SIDE_LOW), _SIDE_HIGH))
+    fine = _carved(photos, low, size, side, cautious=False)
+    if not bool(fine.occupied.any()):  # thinner than a voxel everywhere
+        fine = _carved(photos, low, size, side, cautious=True)
+    return fine if bool(fine.occupied.any()) else None
+
+
+def _carved(
+    photos: list[Photo], low: Float[Tensor, "3"], size: Float[Tensor, "3"], side: int, *, cautious: bool
+) -> Grid:
+    """About side³ cubic voxels that fill a box, kept where their centres (or, cautiously, any part) are in the hull."""
+    voxel = float(size.prod()) ** (1 / 3) / side
+    shape = [max(1, math.ceil(float(extent) / voxel)) for extent in size]
+    grid = Grid(torch.ones(shape, dtype=torch.bool), low, voxel)
+    kept = in_hull(photos, grid.centers(grid.occupied), voxel * math.sqrt(3) / 2 if cautious else 0.0)
+    return Grid(kept.view(shape), low, voxel)
+
+
+def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0.0) -> Bool[Tensor, "N"]:
+    """True where every photo that shows a point shows it solid, and at least half of the photos show it.
+
+    With a `radius` (scene units) a point counts as solid when anything within it may be.
+    """
+    alive = torch.arange(len(points))
+    shown = torch.zeros(len(points), dtype=torch.int32)
+    for photo in photos:
+        here = points[alive]
+        column, row, depth = project(photo.camera, here)
+        visible = inside(photo.camera, column, row, depth)
+        alpha = _widened(photo, radius, depth[visible]) if radius else photo.alpha()
+        solid = torch.ones(len(alive), dtype=torch.bool)
+        solid[visible] = sample(alpha, column[visible], row[visible])[0] > _SOLID
+        shown[alive] += visible.int()
+        alive = alive[solid]
+    kept = torch.zeros(len(points), dtype=torch.bool)
+    kept[alive] = 2 * shown[alive] >= len(photos)
+    return kept
+
+
+def _widened(photo: Photo, radius: float, depths: Float[Tensor, "M"]) -> Float[Tensor, "1 H W"]:
+    """Alpha spread by what `radius` covers at the median depth, px."""
+    if len(depths) == 0:
+        return photo.alpha()
+    reach = radius * float(photo.camera.Ks[0].diagonal()[:2].max()) / float(depths.median())
+    pixels = min(math.ceil(reach), max(photo.planes.shape[1:]))
+    alpha = photo.alpha()[None]
+    for shape in ((2 * pixels + 1, 1), (1, 2 * pixels + 1)):
+        alpha = torch.nn.functional.max_pool2d(alpha, shape, stride=1, padding=(shape[0] // 2, shape[1] // 2))
+    return alpha[0]
+
+
+def _sample_points(grid: Grid, photos: list[Photo], count: int, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+    """Points near the surface and points inside, each accepted by `in_hull`."""
+    core = _eroded(grid.occupied)
+    rim = _dilated(grid.occupied) & ~core
+    on_surface = count if not bool(core.any()) else round(SURFACE_SHARE * count)
+    surface = _accepted(grid, rim, photos, on_surface, generator)
+    inner = _accepted(grid, core, photos, count - len(surface), generator)
+    return torch.cat([surface, inner])
+
+
+def _accepted(
+    grid: Grid, cells: Bool[Tensor, "X Y Z"], photos: list[Photo], count: int, generator: torch.Generator
+) -> Float[Tensor, "N 3"]:
+    """`count` uniform random points in `cells` and in the hull; fewer when few places are."""
+    corners = grid.centers(cells) - 0.5 * grid.voxel
+    accepted = [torch.empty(0, 3)]
+    for _ in range(_ROUNDS if len(corners) else 0):
+        missing = count - sum(map(len, accepted))
+        if missing <= 0:
+            break
+        drawn = torch.randint(len(corners), (2 * missing,), generator=generator)
+        points = corners[drawn] + grid.voxel * torch.rand(2 * missing, 3, generator=generator)
+        accepted.append(points[in_hull(photos, points)])
+    return torch.cat(accepted)[:count]
+
+
+def unoccluded_colors(grid: Grid, photos: list[Photo], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Mean colour over the photos in which a point lies nearest behind the hull's front surface.
+
+    For a point on the surface these are the photos that see it; for one inside, those that see the surface before it.
+    """
+    front = grid.centers(grid.occupied & ~_eroded(grid.occupied))
+    covers = [_front_depths(grid, photo, front) for photo in photos]
+    colors = [_colors_of(grid, photos, covers, chunk) for chunk in points.split(_CHUNK)]
+    return torch.cat(colors)
+
+
+def _colors_of(
+    grid: Grid, photos: list[Photo], covers: list[tuple[Tensor, int]], points: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    buried = torch.full((len(photos), len(points)), math.inf)
+    for index, (photo, (cover, step)) in enumerate(zip(photos, covers, strict=True)):
+        column, row, depth = project(photo.camera, points)
+        shown = torch.nonzero(inside(photo.camera, column, row, depth))[:, 0]
+        nearest = cover[_cells(row[shown], step, cover.shape[0]), _cells(column[shown], step, cover.shape[1])]
+        buried[index, shown] = (depth[shown] - nearest).clamp(min=0)
+    # A voxel and a half: the front depths are those of voxel centres.
+    chosen = buried <= buried.amin(dim=0) + 1.5 * grid.voxel
+    total = torch.zeros(4, len(points))
+    for index, photo in enumerate(photos):
+        rows = torch.nonzero(chosen[index] & buried[index].isfinite())[:, 0]
+        column, row, _ = project(photo.camera, points[rows])
+        total[:, rows] += sample(photo.planes.float(), column, row) / 255
+    return colors_from_sums(total)
+
+
+def _front_depths(grid: Grid, photo: Photo, front: Float[Tensor, "M 3"]) -> tuple[Float[Tensor, "h w"], int]:
+    """Smallest depth of the hull per block of `step` pixels (about a voxel large), infinite where there is none."""
+    column, row, depth = project(photo.camera, front)
+    shown = inside(photo.camera, column, row, depth)
+    column, row, depth = column[shown], row[shown], depth[shown]
+    footprint = grid.voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth.median()) if len(depth) else 1.0
+    step = max(1, math.ceil(1.5 * footprint))
+    height, width = math.ceil(photo.camera.height / step), math.ceil(photo.camera.width / step)
+    block = _cells(row, step, height) * width + _cells(column, step, width)
+    cover = torch.full((height * width,), math.inf).scatter_reduce(0, block, depth, "amin")
+    return cover.view(height, width), step
+
+
+def _cells(coordinate: Tensor, step: int, count: int) -> Tensor:
+    return (coordinate / step).long().clamp(0, count - 1)
+
+
+def _dilated(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
+    """With the 26 neighbours of every true voxel."""
+    return torch.nn.functional.max_pool3d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
+
+
+def _eroded(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
+    """Without the voxels that have one of their 26 neighbours outside, the grid's border included."""
+    padded = torch.nn.functional.pad((~cells)[None, None].float(), (1,) * 6, value=1.0)
+    return torch.nn.functional.max_pool3d(padded, 3, stride=1)[0, 0] == 0
