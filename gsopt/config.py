@@ -178,7 +178,7 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class SparseConfig:
-    """Regularisers for few views (see docs/decisions); switched on together at or below `below_views` input views."""
+    """Regularisers for few views, switched on together at or below `below_views` input views."""
 
     below_views: int = 16
     """Number of input views from which on down they are active; 0 turns them off."""
@@ -187,11 +187,11 @@ class SparseConfig:
     floater_every: int = 500
     """Steps between two prunings by nearest-neighbour distance (GaussianObject, Yang et al. 2024); 0 = never."""
     lambda_opacity: float = 0.01
-    """Replaces that of LossConfig where this is larger."""
+    """Replaces the weight of LossConfig where this is larger."""
     lambda_scale: float = 0.01
-    """Replaces that of LossConfig where this is larger."""
+    """Replaces the weight of LossConfig where this is larger."""
     lambda_alpha: float = 0.1
-    """Replaces that of LossConfig where this is larger."""
+    """Replaces the weight of LossConfig where this is larger."""
     sh_degree: int = 2
     """Upper bound on the bands."""
 
@@ -210,7 +210,7 @@ class ScheduleConfig:
     """Skip what a step does not need."""
 
     coarse_until: tuple[int, ...] = ()
-    """Steps at which the resolution doubles, e.g. (500, 1500): quarter, half, full."""
+    """Steps at which the resolution doubles, e.g. 500 1500: quarter, half, full."""
     stop_when_flat: bool = False
     """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
 

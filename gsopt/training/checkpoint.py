@@ -79,9 +79,3 @@ def read_checkpoint(path: Path) -> Checkpoint:
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"The checkpoint {path} cannot be read ({error}). The one before it is used.") from error
     return Checkpoint(path, tensors, meta)
-
-
-def sweep(folder: Path) -> None:
-    """Remove what a killed writer left half done."""
-    for leftover in folder.glob(".step_*.tmp"):
-        leftover.unlink(missing_ok=True)

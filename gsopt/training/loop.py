@@ -21,7 +21,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.training import schedule
-from gsopt.training.checkpoint import load_newest, save_checkpoint, saved, sweep
+from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.guard import require_finite, require_finite_loss
 from gsopt.training.interrupt import StopRequest
 from gsopt.training.run_directory import Listener, RunDirectory, opened
@@ -131,7 +131,6 @@ class Clock:
 def _start(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> tuple[Trainer, float]:
     """A trainer at step 0 or at the newest checkpoint, and the seconds already spent."""
     names = [view.name for view in scene.train]
-    sweep(directory.checkpoints)
     checkpoint = load_newest(directory.checkpoints, directory.warn)
     if checkpoint is None:
         highest = schedule.max_sh_degree(config, len(names))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.gaussians import Gaussians
@@ -36,28 +36,19 @@ def add_scale_gradient(v_log_scales: Float[Tensor, "N 3"], log_scales: Float[Ten
 
 @dataclass(frozen=True)
 class Dropout:
-    """Which Gaussians a step draws; their opacity is divided by the share kept (DropGaussian, Park et al. 2025)."""
+    """A step that draws some Gaussians; their opacity is divided by the share kept (DropGaussian, Park et al. 2025)."""
 
-    kept: Bool[Tensor, "N"]
-    keep_probability: float
+    drawn: Gaussians
+    """With opacities o' = min(o / share, 0.999), or none where left out."""
+    slope: Float[Tensor, "N"]
+    """dlogit'/dlogit = o(1-o)/share / (o'(1-o')) = (1-o)/(1-o'); zero where left out or clamped."""
 
     @staticmethod
-    def draw(count: int, rate: float, generator: torch.Generator) -> Dropout:
-        """Leave each of `count` Gaussians out with probability `rate`."""
-        return Dropout(torch.rand(count, generator=generator) >= rate, 1 - rate)
-
-    def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians as drawn: o' = min(o / keep_probability, 0.999), or nothing."""
-        raised = (gaussians.opacities / self.keep_probability).clamp_(1e-30, OPAQUE)
-        absent = torch.full_like(raised, ABSENT)
-        return replace(gaussians, logit_opacities=torch.where(self.kept, torch.logit(raised), absent))
-
-    def chain(self, v_logit_opacities: Float[Tensor, "N"], logit_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-        """From the gradient at the drawn logit to that at the stored one.
-
-        With o' = o/k: dlogit'/dlogit = o(1-o)/k / (o'(1-o')) = (1-o)/(1-o'). Zero where left out or clamped.
-        """
-        opacities = torch.sigmoid(logit_opacities)
-        raised = opacities / self.keep_probability
-        passes = self.kept & (raised < OPAQUE)
-        return torch.where(passes, v_logit_opacities * (1 - opacities) / (1 - raised), torch.zeros_like(raised))
+    def of(gaussians: Gaussians, rate: float, generator: torch.Generator) -> Dropout:
+        """Leave each Gaussian out with probability `rate`."""
+        opacities = gaussians.opacities
+        raised = (opacities / (1 - rate)).clamp_(1e-30, OPAQUE)
+        missing = torch.rand(len(gaussians), generator=generator) < rate
+        slope = (1 - opacities).div_(1 - raised).masked_fill_(missing.logical_or(raised == OPAQUE), 0.0)
+        logits = torch.logit(raised).masked_fill_(missing, ABSENT)
+        return Dropout(replace(gaussians, logit_opacities=logits), slope)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 from gsopt import __version__
 from gsopt.config import TrainConfig
 from gsopt.errors import GsoptError, InputError, UsageError
-from gsopt.events import EventWriter, read_events, to_json, write_atomic
+from gsopt.events import EventWriter, to_json, write_atomic
 
 Listener = Callable[[Mapping[str, Any]], None]
 
@@ -21,6 +22,8 @@ Listener = Callable[[Mapping[str, Any]], None]
 WORK = ("splat.ply", "metrics.json", "report.html", "previews/*", "checkpoints/*.safetensors")
 # Settings that may differ when a run is resumed: they do not change a bit of the result.
 FREE = ("threads", "checkpoint_every", "preview_every")
+# How whole-or-nothing writers name a file before it is whole: a dot, its name, the process.
+TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
 PACKAGES = ("torch", "numpy", "pillow", "safetensors")
 
 
@@ -71,6 +74,7 @@ def opened(path: Path, config: TrainConfig, resume: bool, listener: Listener | N
         run.stop_file.unlink(missing_ok=True)  # a request to an earlier run, which heeded it
         run.previews.mkdir(exist_ok=True)
         run.checkpoints.mkdir(exist_ok=True)
+        sweep(path, run.previews, run.checkpoints)
         yield run
     except BaseException as error:
         run.emit("error", message=describe(error), exit_code=exit_code(error))
@@ -89,6 +93,14 @@ def make_folder(path: Path) -> None:
 def work_in(path: Path) -> Path | None:
     """The first thing found in a folder that a new run would overwrite, or None."""
     return next((found for pattern in WORK for found in sorted(path.glob(pattern))), None)
+
+
+def sweep(*folders: Path) -> None:
+    """Remove what a killed writer left half done. The lock is held: nobody else is writing."""
+    for folder in folders:
+        for file in folder.iterdir():
+            if TEMPORARY.fullmatch(file.name):
+                file.unlink(missing_ok=True)
 
 
 def versions() -> dict[str, str]:
@@ -141,9 +153,3 @@ def first_difference(old: dict[str, Any], new: dict[str, Any], where: str = "") 
             return first_difference(value, new[key], f"{name}.")
         return f"`{name}` was {value!r}, now {new[key]!r}"
     return None
-
-
-def is_running(path: Path) -> bool:
-    """Whether the last event in the folder is not a final one: the run goes on, or was killed."""
-    events, _ = read_events(path / "events.jsonl")
-    return bool(events) and events[-1]["kind"] not in ("done", "stopped", "error")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -104,8 +104,9 @@ class Trainer:
         self, target: Target, background: Float[Tensor, "3"], settings: RasterSettings
     ) -> tuple[float, Gradients]:
         """Forward, loss, backward, regularisers; density control takes note."""
-        gaussians, dropout = self._drawn()
-        frame = self.backend.forward(gaussians, target.camera, settings, background)
+        dropout = self._dropout()
+        drawn = self.model.gaussians if dropout is None else dropout.drawn
+        frame = self.backend.forward(drawn, target.camera, settings, background)
         photometric = self.backend.photometric(frame.colors, target.colors, self.config.loss.lambda_dssim)
         v_alphas = None
         if self._weights.alpha > 0 and target.alphas is not None:
@@ -116,21 +117,16 @@ class Trainer:
         self._show(photometric.loss, frame.colors, target.colors)
         return photometric.loss, self._regularized(gradients, dropout)
 
-    def _drawn(self) -> tuple[Gaussians, Dropout | None]:
-        """The Gaussians of this step: all of them, or with few views a random part."""
-        gaussians = self.model.gaussians
+    def _dropout(self) -> Dropout | None:
+        """With few views a step draws a random part of the Gaussians."""
         rate = schedule.dropout(self.step, self.config.iterations, self.config) if self._sparse else 0.0
-        if rate == 0:
-            return gaussians, None
-        dropout = Dropout.draw(len(gaussians), rate, self._generators["dropout"])
-        return dropout.apply(gaussians), dropout
+        return Dropout.of(self.model.gaussians, rate, self._generators["dropout"]) if rate > 0 else None
 
     def _regularized(self, gradients: Gradients, dropout: Dropout | None) -> Gradients:
         """With respect to the stored parameters, terms beside the photometric loss included."""
         gaussians = self.model.gaussians
         if dropout is not None:
-            chained = dropout.chain(gradients.logit_opacities, gaussians.logit_opacities)
-            gradients = replace(gradients, logit_opacities=chained)
+            gradients.logit_opacities.mul_(dropout.slope)
         if self._weights.opacity > 0:
             add_opacity_gradient(gradients.logit_opacities, gaussians.logit_opacities, self._weights.opacity)
         if self._weights.scale > 0:

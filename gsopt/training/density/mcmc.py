@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gsopt import quats as quaternions
 from gsopt.config import DensityConfig
 from gsopt.raster.backend import Gradients
 from gsopt.training import schedule
@@ -22,6 +21,9 @@ STEADY = 0.1
 # One Gaussian stands for at most this many copies in one relocation (the authors' constant).
 MOST_COPIES = 51
 OPAQUE = 1 - 1e-7
+
+Columns = tuple[Tensor, Tensor, Tensor]
+"""x, y and z of M vectors."""
 
 
 class Mcmc:
@@ -43,13 +45,12 @@ class Mcmc:
         rows = torch.nonzero(gaussians.logit_opacities < math.log(STEADY / (1 - STEADY)))[:, 0]
         if len(rows) == 0:
             return
-        mobility = torch.sigmoid((HALF - torch.sigmoid(gaussians.logit_opacities[rows])) * STEEPNESS)
-        xi = torch.randn(len(rows), 3, generator=self._generator)
-        R = quaternions.rotation_matrices(gaussians.quats[rows])
-        variances = (2 * gaussians.log_scales[rows]).exp()
-        local = variances * (R.transpose(1, 2) @ xi[..., None])[..., 0]
-        moves = (R @ local[..., None])[..., 0] * mobility[:, None]
-        gaussians.means[rows] += self._config.noise_lr * lr_means * moves
+        opacities = torch.sigmoid(gaussians.logit_opacities.index_select(0, rows))
+        mobility = torch.sigmoid((HALF - opacities) * STEEPNESS)
+        xi = torch.randn(3, len(rows), generator=self._generator)
+        xi *= mobility * (self._config.noise_lr * lr_means)
+        moves = spread(gaussians.quats.index_select(0, rows), gaussians.log_scales.index_select(0, rows), xi)
+        gaussians.means.index_copy_(0, rows, moves.add_(gaussians.means.index_select(0, rows)))
 
     def refine(self, step: int, model: Model) -> Model:
         """Move the dead, then grow by a fixed share."""
@@ -115,6 +116,30 @@ def shared(opacities: Float[Tensor, "M"], copies: Int[Tensor, "M"]) -> tuple[Flo
         term = -term * new * (n - j + 1).clamp_min(0) / j  # (-1)^(j-1) C(n, j) o'^j, zero for j > n
         total += term / math.sqrt(j)
     return new, o / total
+
+
+def spread(
+    quats: Float[Tensor, "M 4"], log_scales: Float[Tensor, "M 3"], vectors: Float[Tensor, "3 M"]
+) -> Float[Tensor, "M 3"]:
+    """Σ v = R S² Rᵀ v. It runs in every step, so R is never built: Rᵀ v is v turned by the inverse quaternion."""
+    w, x, y, z = quats.T.contiguous()
+    norm = (w * w + x * x + y * y + z * z).sqrt_()
+    w, axis = w / norm, (x / norm, y / norm, z / norm)
+    local = turned(-w, axis, (vectors[0], vectors[1], vectors[2]))
+    variances = log_scales.T.contiguous().mul_(2).exp_()
+    a, b, c = (length * variance for length, variance in zip(local, variances, strict=True))
+    return torch.stack(turned(w, axis, (a, b, c)), dim=1)
+
+
+def turned(w: Tensor, axis: Columns, v: Columns) -> Columns:
+    """v turned by the unit quaternion (w, axis): v + w t + axis × t with t = 2 axis × v; columns of length M."""
+    tx, ty, tz = (2 * part for part in _cross(axis, v))
+    cx, cy, cz = _cross(axis, (tx, ty, tz))
+    return v[0] + w * tx + cx, v[1] + w * ty + cy, v[2] + w * tz + cz
+
+
+def _cross(a: Columns, b: Columns) -> Columns:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def draw(weights: Float[Tensor, "N"], count: int, generator: torch.Generator) -> Int[Tensor, "count"]:

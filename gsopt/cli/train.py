@@ -1,0 +1,231 @@
+"""`gsopt train`: learn Gaussians from posed images, judge them by the held-out views, write a report."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from gsopt import config as settings
+from gsopt.errors import UsageError
+from gsopt.events import to_json, write_atomic
+
+if TYPE_CHECKING:
+    from gsopt.cli.console import RunConsole
+    from gsopt.training.loop import TrainResult
+
+RUNS = Path("runs")
+
+# Flags that may stand beside --resume when DATA does not: they choose where and how fast, not what.
+WITH_RESUME = ("run", "resume", "threads", "checkpoint_every", "preview_every")
+
+
+@dataclass(frozen=True)
+class Density(settings.DensityConfig):
+    """How many Gaussians there are, and where."""
+
+    strategy: Annotated[Literal["adc", "mcmc"], arg(prefix_name=False)] = "adc"
+    """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
+    max_gaussians: Annotated[int, arg(prefix_name=False)] = 1_000_000
+    """Never more than this."""
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Learn Gaussians from the posed images in DATA and write splats, metrics and a report to a run directory."""
+
+    data: Annotated[Positional[Path | None], arg(metavar="DATA")] = None
+    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp or COLMAP."""
+    source_path: Annotated[Path | None, arg(aliases=["-s"], metavar="DATA")] = None
+    """The same as DATA, for those who know Inria's train.py."""
+    run: Annotated[Path | None, arg(aliases=["-m", "--model-path"], metavar="RUN")] = None
+    """Folder to write to; the first free runs/<dataset>-<n> when not given."""
+    resume: bool = False
+    """Continue the run in that folder from its newest checkpoint, with the same result as if it had never stopped."""
+    iterations: int = 7000
+    """Training steps."""
+    views: Annotated[int | None, arg(metavar="N")] = None
+    """Learn from this many input views, well spread by camera position; all when not given."""
+    view_ids: Annotated[str | None, arg(metavar="I,J,...")] = None
+    """Learn from exactly these input views, 0-based in name order, e.g. 2,16,26."""
+    eval: bool = False
+    """Hold out every 8th image when the dataset has no test split of its own."""
+    resolution: Annotated[int, arg(aliases=["-r"])] = 1
+    """Divide width and height by this."""
+    white_background: Annotated[bool, arg(aliases=["-w"])] = False
+    """The same as --background white, which is the default."""
+    background: Literal["white", "black", "random"] | None = None
+    """Behind transparent pixels: white when not given. random draws a color per step and evaluates on white."""
+    init: Literal["auto", "points", "hull", "random"] = "auto"
+    """First Gaussians: SfM points, the visual hull of the masks, or random ones where the cameras look."""
+    init_count: int = 20_000
+    """How many to make (hull and random)."""
+    seed: int = 0
+    """Same seed, same data, same bits."""
+    backend: Literal["auto", "cpu", "reference"] = "auto"
+    """reference is plain torch: a slow oracle for tiny scenes."""
+    threads: int = 0
+    """0 = one per core. The result does not depend on it."""
+    antialiased: bool = False
+    """Mip-Splatting's 2D filter."""
+    lambda_sds: float = 0.0
+    """Weight of the guidance by a diffusion model; only 0 in this version."""
+    checkpoint_every: int = 1000
+    """Steps between two checkpoints; 0 = only at the end."""
+    preview_every: int = 500
+    """Steps between two preview PLYs; 0 = none."""
+    cache_mb: int = 2048
+    """Decoded images kept in memory, MB; the rest is read again when needed."""
+    density: Density = field(default_factory=Density)
+    loss: settings.LossConfig = field(default_factory=settings.LossConfig)
+    optimizer: settings.OptimizerConfig = field(default_factory=settings.OptimizerConfig)
+    sparse: settings.SparseConfig = field(default_factory=settings.SparseConfig)
+    schedule: settings.ScheduleConfig = field(default_factory=settings.ScheduleConfig)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `gsopt train` with these arguments: 0 when done or stopped, else a GsoptError or KeyboardInterrupt."""
+    flags = tyro.cli(Flags, prog="gsopt train", args=list(argv))
+    config, run = read_flags(flags)
+
+    from gsopt.cli.console import RunConsole
+    from gsopt.training.loop import train
+
+    console = RunConsole(run)
+    try:
+        result = train(config, run, resume=flags.resume, on_progress=console, done=False)
+        console.close()
+        if result.stopped:
+            console.say(f"splats so far: {run / 'splat.ply'}")
+        else:
+            judge(config, result, console)
+    finally:
+        console.close()
+    return 0
+
+
+def judge(config: settings.TrainConfig, result: TrainResult, console: RunConsole) -> None:
+    """Evaluate, write the report, and end the run with the event `done` (`error` when one of these fails)."""
+    from gsopt.cli.console import clock
+    from gsopt.evaluate import evaluate, read_metrics
+    from gsopt.report import write_report
+    from gsopt.training.run_directory import opened
+
+    with opened(result.run, config, resume=True, listener=console) as directory:
+        console.say(f"trained in {clock(result.train_seconds)}; judging {result.run / 'splat.ply'}")
+        facts = {
+            "train_seconds": round(result.train_seconds, 3),
+            "peak_memory_mb": None if result.peak_memory_mb is None else round(result.peak_memory_mb, 1),
+            "n_gaussians": len(result.gaussians),
+            "steps": result.steps,
+            "init": result.init,
+        }
+        write_atomic(result.run / "metrics.json", to_json({**read_metrics(result.run), **facts}))
+        metrics = evaluate(result.run, threads=config.threads, scene=result.scene)
+        write_report(result.run)
+        directory.emit("done", step=result.steps, n=len(result.gaussians), seconds=facts["train_seconds"])
+    console.say(summary(metrics))
+    console.say(f"report: {result.run / 'report.html'}")
+
+
+def summary(metrics: Mapping[str, Any]) -> str:
+    """One line of figures, and whose they are."""
+    held_out = metrics["mean"] is not None
+    judged = metrics if held_out else metrics["train"]
+    names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips_alex": "LPIPS {:.4f}"}
+    figures = [text.format(judged["mean"][name]) for name, text in names.items() if judged["mean"][name] is not None]
+    count = len(judged["per_view"])
+    whose = f"{count} held-out view{'s' * (count != 1)}" if held_out else "input views (none was held out)"
+    memory = "" if metrics["peak_memory_mb"] is None else f", peak memory {metrics['peak_memory_mb']:.0f} MB"
+    return f"{'  '.join(figures)} over {whose}; {metrics['n_gaussians']:,} Gaussians{memory}"
+
+
+def read_flags(flags: Flags) -> tuple[settings.TrainConfig, Path]:
+    """The configuration and the run directory that the flags ask for; UsageError where they contradict each other."""
+    if flags.lambda_sds != 0:
+        raise UsageError(
+            f"`--lambda-sds` must be 0, got {flags.lambda_sds}: guidance by a diffusion model is not in this version "
+            "yet. Drop the flag to learn from the images alone."
+        )
+    data = one_data_folder(flags)
+    if flags.resume and flags.run is None:
+        raise UsageError("`--resume` needs the run to continue, got no folder. Add -m RUN.")
+    if data is None and flags.resume and flags.run is not None:
+        return recorded_config(flags, flags.run), flags.run
+    if data is None:
+        raise UsageError("A dataset folder is needed, got none. Give it as `gsopt train DATA` or with -s.")
+    return make_config(flags, data), flags.run or free_folder(data)
+
+
+def one_data_folder(flags: Flags) -> Path | None:
+    """DATA or --source-path."""
+    if flags.data is not None and flags.source_path is not None and flags.data != flags.source_path:
+        raise UsageError(f"Two dataset folders were given, {flags.data} and -s {flags.source_path}. Keep one of them.")
+    return flags.data or flags.source_path
+
+
+def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
+    """All settings of a new run. The dataset's path is made absolute, so that the run can be resumed from anywhere."""
+    if flags.white_background and flags.background not in (None, "white"):
+        raise UsageError(f"`-w` and `--background {flags.background}` contradict each other. Keep one of them.")
+    return settings.TrainConfig(
+        data=settings.DataConfig(
+            path=str(data.expanduser().absolute()),
+            views=flags.views,
+            view_ids=None if flags.view_ids is None else read_ids(flags.view_ids),
+            downscale=flags.resolution,
+            eval=flags.eval,
+            background=flags.background or "white",
+            cache_mb=flags.cache_mb,
+        ),
+        init=settings.InitConfig(flags.init, flags.init_count),
+        optimizer=flags.optimizer,
+        loss=flags.loss,
+        density=settings.DensityConfig(**dataclasses.asdict(flags.density)),
+        sparse=flags.sparse,
+        schedule=flags.schedule,
+        iterations=flags.iterations,
+        seed=flags.seed,
+        backend=flags.backend,
+        threads=flags.threads,
+        antialiased=flags.antialiased,
+        checkpoint_every=flags.checkpoint_every,
+        preview_every=flags.preview_every,
+    )
+
+
+def recorded_config(flags: Flags, run: Path) -> settings.TrainConfig:
+    """The settings a run was started with; flags that would change them are refused."""
+    default = Flags()
+    for name in (item.name for item in dataclasses.fields(Flags) if item.name not in WITH_RESUME):
+        if getattr(flags, name) != getattr(default, name):
+            raise UsageError(
+                f"`--{name.replace('_', '-')}` was given with --resume, which takes all settings from "
+                f"{run / 'config.json'}. Drop the flag, or give DATA and all flags of the run again."
+            )
+    return replace(
+        settings.TrainConfig.read(run / "config.json"),
+        threads=flags.threads,
+        checkpoint_every=flags.checkpoint_every,
+        preview_every=flags.preview_every,
+    )
+
+
+def read_ids(text: str) -> tuple[int, ...]:
+    """2,16,26 as numbers."""
+    try:
+        return tuple(int(part) for part in text.replace(",", " ").split())
+    except ValueError as error:
+        raise UsageError(f"`--view-ids` must be whole numbers and commas, got {text!r}. Try 2,16,26.") from error
+
+
+def free_folder(data: Path) -> Path:
+    """The first of runs/<dataset>-1, runs/<dataset>-2, ... that does not exist."""
+    name = data.expanduser().resolve().name or "scene"
+    return next(folder for n in itertools.count(1) if not (folder := RUNS / f"{name}-{n}").exists())

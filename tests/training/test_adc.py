@@ -1,0 +1,176 @@
+"""Laws of clone, split, prune and reset."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tiny_scenes import cloud
+from torch import Tensor
+
+from gsopt.config import DensityConfig
+from gsopt.gaussians import Gaussians
+from gsopt.raster.backend import Gradients
+from gsopt.training.density import at_least_one
+from gsopt.training.density.adc import SPLIT_SHRINK, Adc, best, split
+from gsopt.training.optimizer import Model
+
+EXTENT = 2.0
+CONFIG = DensityConfig(refine_start=0, refine_every=10, refine_stop=100, grow_grad2d=1e-3, reset_every=50)
+ITERATIONS = 10_000
+
+
+def controlled(model: Model, config: DensityConfig = CONFIG) -> Adc:
+    return Adc(config, ITERATIONS, EXTENT, len(model), torch.Generator().manual_seed(0))
+
+
+def pulled(count: int, rows: Tensor, strength: float = 1.0, absolute: bool = False) -> Gradients:
+    """Gradients of the projected centres that lie on `rows` only."""
+    v = torch.zeros(count, 2)
+    v[rows, 0] = strength
+    nothing = dict.fromkeys(("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"), torch.empty(0))
+    return Gradients(**nothing, means2d=torch.zeros(count, 2) if absolute else v, means2d_abs=v if absolute else None)
+
+
+def scene(scales: list[float], opacities: list[float]) -> Gaussians:
+    """Gaussians of these scales and opacities."""
+    base = cloud(len(scales), seed=2)
+    return Gaussians(
+        base.means,
+        base.quats,
+        torch.tensor(scales).log()[:, None].repeat(1, 3),
+        torch.logit(torch.tensor(opacities)),
+        base.sh0,
+        base.shN,
+    )
+
+
+def seen(count: int) -> Tensor:
+    return torch.ones(count, 2, dtype=torch.int32)
+
+
+SMALL, LARGE = 0.5 * CONFIG.grow_scale3d * EXTENT, 2 * CONFIG.grow_scale3d * EXTENT
+
+
+def test_statistics_are_the_mean_norm_in_normalised_device_coordinates() -> None:
+    model = Model.start(cloud(3, seed=1))
+    density = controlled(model)
+    radii = torch.tensor([[2, 2], [3, 3], [0, 0]], dtype=torch.int32)
+    v = torch.tensor([[3.0, 0.0], [0.5, 1.0], [0.0, 0.0]])
+    gradients = pulled(3, torch.tensor([0]))
+    gradients.means2d.copy_(v)
+    density.after_backward(1, gradients, radii, width=20, height=10)
+    density.after_backward(2, gradients, radii * torch.tensor([[1], [0], [0]], dtype=torch.int32), width=20, height=10)
+    torch.testing.assert_close(density.grad_sum, torch.tensor([60.0, 2 * math.hypot(5, 5), 0.0]))
+    assert density.seen.tolist() == [2, 1, 0]
+
+
+def test_the_absolute_gradient_is_used_when_there_is_one() -> None:
+    model = Model.start(cloud(4, seed=1))
+    density = controlled(model)
+    density.after_backward(1, pulled(4, torch.tensor([2]), absolute=True), seen(4), 10, 10)
+    assert density.grad_sum.nonzero().flatten().tolist() == [2]
+
+
+def test_small_ones_are_cloned_large_ones_split_and_the_rest_stay() -> None:
+    gaussians = scene([SMALL, LARGE, SMALL, LARGE], [0.5] * 4)
+    model = Model.start(gaussians)
+    model.exp_avg.means.fill_(7.0)
+    density = controlled(model)
+    density.after_backward(5, pulled(4, torch.tensor([0, 1])), seen(4), 10, 10)
+    grown = density.refine(10, model)
+
+    assert len(grown) == 6  # 0, 2, 3, the clone of 0, the two halves of 1
+    torch.testing.assert_close(grown.gaussians.means[:3], gaussians.means[[0, 2, 3]], rtol=0, atol=0)
+    for name, tensor in grown.gaussians.items():
+        assert torch.equal(tensor[3], getattr(gaussians, name)[0])
+    halves = grown.gaussians.select(torch.tensor([4, 5]))
+    torch.testing.assert_close(halves.scales, torch.full((2, 3), LARGE / SPLIT_SHRINK))
+    assert grown.exp_avg.means.tolist() == [[7.0] * 3] * 3 + [[0.0] * 3] * 3
+    assert not density.grad_sum.any()
+    assert len(density.grad_sum) == 6
+
+
+def test_below_the_threshold_nothing_grows() -> None:
+    model = Model.start(scene([SMALL, LARGE], [0.5, 0.5]))
+    density = controlled(model)
+    density.after_backward(5, pulled(2, torch.tensor([0, 1]), strength=0.9e-3 / 5), seen(2), 10, 10)
+    assert len(density.refine(10, model)) == 2
+
+
+@pytest.mark.parametrize("budget", [10, 13, 17, 20, 25])
+def test_the_budget_is_exact_and_goes_to_the_highest_scores(budget: int) -> None:
+    config = DensityConfig(**{**CONFIG.__dict__, "max_gaussians": budget})
+    model = Model.start(scene([SMALL] * 10, [0.5] * 10))
+    density = controlled(model, config)
+    gradients = pulled(10, torch.arange(10))
+    gradients.means2d[:, 0] = torch.arange(1.0, 11.0).flip(0)
+    density.after_backward(5, gradients, seen(10), 10, 10)
+    grown = density.refine(10, model)
+    assert len(grown) == min(budget, 20)
+    assert torch.equal(grown.gaussians.means[10:], model.gaussians.means[: min(budget, 20) - 10])
+
+
+def test_equal_scores_are_taken_in_row_order() -> None:
+    chosen = best(torch.tensor([True, False, True, True]), torch.ones(4), room=2)
+    assert chosen.tolist() == [True, False, True, False]
+
+
+def test_halves_are_drawn_from_the_gaussian_they_replace() -> None:
+    one = cloud(1, seed=4)
+    many = split(one.select(torch.zeros(20_000, dtype=torch.int64)), torch.Generator().manual_seed(1))
+    offsets = (many.means - one.means).double()
+    from gsopt.raster.reference import covariances
+
+    expected = covariances(one.quats, one.log_scales)[0].double()
+    covariance = offsets.T @ offsets / len(offsets)
+    torch.testing.assert_close(covariance, expected, rtol=0, atol=0.03 * float(expected.diagonal().max()))
+    assert float(offsets.mean(0).norm()) < 0.02 * float(one.scales.max())
+
+
+def test_the_transparent_go_and_the_huge_go_once_opacities_were_reset() -> None:
+    huge = 2 * CONFIG.prune_scale3d * EXTENT
+    gaussians = scene([SMALL, SMALL, huge], [0.5, 0.5 * CONFIG.prune_opacity, 0.5])
+    early, late = Model.start(gaussians), Model.start(gaussians)
+    assert torch.equal(controlled(early).refine(10, early).gaussians.means, gaussians.means[[0, 2]])
+    assert torch.equal(controlled(late).refine(60, late).gaussians.means, gaussians.means[[0]])
+
+
+def test_a_reset_caps_opacities_and_forgets_their_moments() -> None:
+    model = Model.start(scene([SMALL] * 3, [0.9, 0.5, 0.008]))
+    for moments in (model.exp_avg, model.exp_avg_sq):
+        moments.logit_opacities.fill_(1.0)
+        moments.means.fill_(1.0)
+    refined = controlled(model).refine(50, model)
+    torch.testing.assert_close(refined.gaussians.opacities, torch.tensor([0.01, 0.01, 0.008]))
+    assert not refined.exp_avg.logit_opacities.any()
+    assert not refined.exp_avg_sq.logit_opacities.any()
+    assert refined.exp_avg.means.all()
+
+
+def test_between_refinements_the_record_is_the_very_same() -> None:
+    model = Model.start(cloud(5, seed=1))
+    density = controlled(model)
+    assert all(density.refine(step, model) is model for step in (1, 9, 11, 101, 110))
+
+
+def test_something_is_always_left() -> None:
+    model = Model.start(scene([SMALL] * 3, [1e-4, 3e-4, 2e-4]))
+    refined = controlled(model).refine(10, model)
+    assert torch.equal(refined.gaussians.means, model.gaussians.means[[1]])
+    assert len(at_least_one(torch.zeros(0, dtype=torch.bool), torch.zeros(0))) == 0
+
+
+def test_statistics_follow_rows_and_return_from_a_checkpoint() -> None:
+    model = Model.start(cloud(6, seed=1))
+    density = controlled(model)
+    density.after_backward(1, pulled(6, torch.tensor([1, 4]), 2.0), seen(6), 10, 10)
+    rows = torch.tensor([4, 0, 5])
+    before = density.grad_sum[rows]
+    density.select(rows)
+    assert torch.equal(density.grad_sum, before)
+    other = controlled(model)
+    other.restore(density.tensors())
+    assert torch.equal(other.grad_sum, density.grad_sum)
+    assert torch.equal(other.seen, density.seen)

@@ -1,0 +1,126 @@
+"""Laws of relocation, growth and noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_scenes import cloud
+
+from gsopt.config import DensityConfig
+from gsopt.raster.reference import covariances
+from gsopt.training.density.mcmc import Mcmc, draw, shared, spread
+from gsopt.training.optimizer import Model
+
+CONFIG = DensityConfig(strategy="mcmc", refine_start=0, refine_every=10, refine_stop=100, max_gaussians=60)
+
+
+def controlled(config: DensityConfig = CONFIG) -> Mcmc:
+    return Mcmc(config, 1000, torch.Generator().manual_seed(0))
+
+
+def paper_factor(opacity: float, n: int) -> float:
+    """The factor on the scales as the paper writes it (eq. 9), with its double sum."""
+    new = 1 - (1 - opacity) ** (1 / n)
+    total = sum(
+        math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1) for i in range(1, n + 1) for k in range(i)
+    )
+    return opacity / total
+
+
+@given(opacity=st.floats(0.005, 0.999), n=st.integers(1, 51))
+def test_shared_is_equation_nine(opacity: float, n: int) -> None:
+    new, factor = shared(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n]))
+    assert 1 - (1 - float(new)) ** n == pytest.approx(opacity, rel=1e-9)  # n of them are as opaque as the one
+    assert float(factor) == pytest.approx(paper_factor(opacity, n), rel=1e-6)
+
+
+def test_sharing_with_nobody_changes_nothing() -> None:
+    o = torch.linspace(0.01, 0.99, 20, dtype=torch.float64)
+    new, factor = shared(o, torch.ones(20, dtype=torch.int64))
+    torch.testing.assert_close(new, o)
+    torch.testing.assert_close(factor, torch.ones(20, dtype=torch.float64))
+
+
+def test_the_dead_are_moved_onto_the_living_with_fresh_moments() -> None:
+    gaussians = cloud(40, seed=1)
+    dead = torch.arange(0, 40, 4)
+    gaussians.logit_opacities[dead] = -9.0
+    model = Model.start(replace(gaussians, logit_opacities=gaussians.logit_opacities.clamp_min(-9.0)))
+    model.exp_avg.means.fill_(1.0)
+    config = replace(CONFIG, max_gaussians=40)
+    refined = controlled(config).refine(10, model)
+
+    assert len(refined) == 40
+    living = torch.ones(40, dtype=torch.bool)
+    living[dead] = False
+    assert bool((refined.gaussians.opacities >= config.prune_opacity).all())
+    assert torch.equal(refined.gaussians.means[living], gaussians.means[living])
+    sources = (refined.gaussians.means[dead][:, None] == gaussians.means[living]).all(-1)
+    assert bool(sources.any(dim=1).all())
+    assert not refined.exp_avg.means[dead].any()
+    for row in dead.tolist():  # twins: the same opacity and scale as the source now has
+        twin = (refined.gaussians.means == refined.gaussians.means[row]).all(-1)
+        assert len(refined.gaussians.logit_opacities[twin].unique()) == 1
+        assert len(refined.gaussians.log_scales[twin].unique(dim=0)) == 1
+
+
+@pytest.mark.parametrize(("count", "budget", "after"), [(40, 60, 42), (59, 60, 60), (60, 60, 60)])
+def test_growth_is_five_per_cent_up_to_the_budget(count: int, budget: int, after: int) -> None:
+    model = Model.start(cloud(count, seed=2))
+    refined = controlled(replace(CONFIG, max_gaussians=budget)).refine(10, model)
+    assert len(refined) == after
+
+
+def test_outside_its_window_the_record_is_the_very_same() -> None:
+    model = Model.start(cloud(5, seed=1))
+    assert all(controlled().refine(step, model) is model for step in (1, 9, 110))
+
+
+def test_nothing_alive_moves_nothing() -> None:
+    model = Model.start(replace(cloud(5, seed=1), logit_opacities=torch.full((5,), -9.0)))
+    before = model.gaussians.means.clone()
+    refined = controlled().refine(10, model)
+    assert torch.equal(refined.gaussians.means[:5], before)
+
+
+def test_spread_multiplies_by_the_covariance() -> None:
+    gaussians = cloud(30, seed=6).to(torch.float64)
+    vectors = torch.randn(3, 30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = (covariances(gaussians.quats, gaussians.log_scales) @ vectors.T[..., None])[..., 0]
+    torch.testing.assert_close(spread(gaussians.quats, gaussians.log_scales, vectors), expected)
+
+
+def test_noise_moves_the_faint_along_their_covariance_and_leaves_the_opaque() -> None:
+    one = cloud(1, seed=3)
+    count = 20_000
+    rows = torch.zeros(count, dtype=torch.int64)
+    logits = torch.full((count,), math.log(0.005 / 0.995))
+    logits[: count // 2] = 2.0
+    model = Model.start(replace(one.select(rows), logit_opacities=logits))
+    controlled().after_step(model, lr_means=1e-3)
+    moves = (model.gaussians.means - one.means).double()
+    assert not moves[: count // 2].any()
+    faint = moves[count // 2 :] / (CONFIG.noise_lr * 1e-3 * 0.5)  # sigmoid(0) at opacity 0.005
+    sigma = covariances(one.quats, one.log_scales)[0].double()
+    expected = sigma @ sigma  # of Σ ξ
+    measured = faint.T @ faint / len(faint)
+    torch.testing.assert_close(measured, expected, rtol=0, atol=0.05 * float(expected.diagonal().max()))
+
+
+def test_noise_is_the_same_for_the_same_generator() -> None:
+    models = [Model.start(replace(cloud(9, seed=1), logit_opacities=torch.full((9,), -5.0))) for _ in range(2)]
+    for model in models:
+        controlled().after_step(model, 1e-3)
+    assert torch.equal(models[0].gaussians.means, models[1].gaussians.means)
+
+
+def test_rows_are_drawn_in_proportion_to_their_weights() -> None:
+    weights = torch.tensor([0.0, 1.0, 3.0, 0.0, 4.0, 0.0])
+    counts = torch.bincount(draw(weights, 80_000, torch.Generator().manual_seed(0)), minlength=6)
+    assert counts[[0, 3, 5]].sum() == 0
+    torch.testing.assert_close(counts / 10_000, weights, rtol=0, atol=0.1)

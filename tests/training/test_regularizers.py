@@ -1,0 +1,90 @@
+"""Every closed form is the derivative of what gsopt/losses.py computes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_scenes import cloud
+from torch import Tensor
+
+from gsopt import losses
+from gsopt.training.regularizers import (
+    ABSENT,
+    OPAQUE,
+    Dropout,
+    add_opacity_gradient,
+    add_scale_gradient,
+    alpha_gradient,
+)
+
+COUNT = 50
+
+
+def autograd(function, at: Tensor) -> Tensor:
+    leaf = at.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(leaf), leaf)
+    return gradient
+
+
+@pytest.fixture
+def gaussians():
+    return cloud(COUNT, seed=3).to(torch.float64)
+
+
+def test_opacity_term(gaussians) -> None:
+    gradient = torch.ones(COUNT, dtype=torch.float64)
+    add_opacity_gradient(gradient, gaussians.logit_opacities, 0.3)
+    expected = 1 + 0.3 * autograd(losses.opacity, gaussians.logit_opacities)
+    torch.testing.assert_close(gradient, expected, rtol=1e-12, atol=0)
+
+
+def test_scale_term(gaussians) -> None:
+    gradient = torch.ones(COUNT, 3, dtype=torch.float64)
+    add_scale_gradient(gradient, gaussians.log_scales, 0.3)
+    torch.testing.assert_close(gradient, 1 + 0.3 * autograd(losses.scale, gaussians.log_scales), rtol=1e-12, atol=0)
+
+
+def test_alpha_term() -> None:
+    generator = torch.Generator().manual_seed(1)
+    alphas, target = torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
+    expected = 0.3 * autograd(lambda a: losses.alpha_l1(a[..., None], target[..., None]), alphas)
+    torch.testing.assert_close(alpha_gradient(alphas, target, 0.3), expected, rtol=1e-12, atol=0)
+
+
+def test_terms_of_an_empty_scene_are_empty() -> None:
+    none = torch.empty(0)
+    add_opacity_gradient(none, none, 1.0)
+    add_scale_gradient(torch.empty(0, 3), torch.empty(0, 3), 1.0)
+
+
+def test_dropout_keeps_the_mean_opacity_and_the_rest_of_the_record(gaussians) -> None:
+    gaussians = cloud(20_000, seed=5).to(torch.float64)
+    dropout = Dropout.of(gaussians, 0.25, torch.Generator().manual_seed(0))
+    drawn = dropout.drawn.opacities
+    left_out = dropout.drawn.logit_opacities == ABSENT
+    assert float(left_out.double().mean()) == pytest.approx(0.25, abs=0.01)
+    kept = ~left_out
+    expected = (gaussians.opacities / 0.75).clamp_max(OPAQUE)
+    torch.testing.assert_close(drawn[kept], expected[kept], rtol=1e-9, atol=0)
+    assert float(drawn[left_out].max()) < 1e-40
+    assert dropout.drawn.means is gaussians.means
+
+
+def test_dropout_slope_is_the_central_difference_of_the_drawn_logit(gaussians) -> None:
+    def drawn_logits(shift: float) -> Dropout:
+        moved = gaussians.logit_opacities + shift
+        record = type(gaussians)(**{**dict(gaussians.items()), "logit_opacities": moved})
+        return Dropout.of(record, 0.2, torch.Generator().manual_seed(9))
+
+    h = 1e-5
+    difference = (drawn_logits(h).drawn.logit_opacities - drawn_logits(-h).drawn.logit_opacities) / (2 * h)
+    slope = drawn_logits(0.0).slope
+    assert 0 < int((slope == 0).sum()) < COUNT  # some left out, some drawn
+    torch.testing.assert_close(slope, difference, rtol=1e-5, atol=1e-8)
+
+
+def test_dropout_passes_nothing_where_the_opacity_is_clamped(gaussians) -> None:
+    opaque = type(gaussians)(**{**dict(gaussians.items()), "logit_opacities": torch.full((COUNT,), 9.0).double()})
+    dropout = Dropout.of(opaque, 0.2, torch.Generator().manual_seed(9))
+    assert not dropout.slope.any()
+    assert float(dropout.drawn.opacities.max()) == pytest.approx(OPAQUE)

@@ -1,0 +1,220 @@
+"""A run that was stopped or killed and resumed is the run that was not: the same bytes."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_scenes import tiny_config
+
+from gsopt.config import DataConfig, DensityConfig, ScheduleConfig, SparseConfig, TrainConfig
+from gsopt.errors import UsageError
+from gsopt.events import read_events
+from gsopt.training import loop
+from gsopt.training.checkpoint import read_checkpoint, saved
+from gsopt.training.loop import train
+from gsopt.training.trainer import Trainer
+
+KILLED_RUN = Path(__file__).with_name("killed_run.py")
+MOMENTS = (
+    "while config.json is completed",
+    "in the middle of a step",
+    "between writing a checkpoint and renaming it",
+    "between the last checkpoint and the splats",
+)
+
+
+class Killed(BaseException):
+    """Stands for a death in the middle of a step."""
+
+
+def configs(dataset: Path) -> dict[str, TrainConfig]:
+    """Runs that between them use every random number and every statistic."""
+    base = tiny_config(dataset)
+    mcmc = DensityConfig(strategy="mcmc", refine_start=4, refine_every=5, refine_stop=25, max_gaussians=70)
+    return {
+        "adc": replace(base, sparse=SparseConfig(below_views=0)),
+        "mcmc": replace(base, density=mcmc, sparse=SparseConfig(below_views=0)),
+        "few views": replace(base, sparse=SparseConfig(floater_every=7)),
+        "random background": replace(base, data=DataConfig(path=str(dataset), background="random")),
+        "coarse to fine": replace(base, schedule=ScheduleConfig(coarse_until=(12,), stop_when_flat=True)),
+    }
+
+
+NAMES = ("adc", "mcmc", "few views", "random background", "coarse to fine")
+
+
+@pytest.fixture(scope="module")
+def whole(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """splat.ply of every uninterrupted run."""
+    folder = tmp_path_factory.mktemp("whole")
+    return {name: run_bytes(config, folder / name) for name, config in configs(dataset).items()}
+
+
+def run_bytes(config: TrainConfig, run: Path, resume: bool = False) -> bytes:
+    train(config, run, resume=resume)
+    return (run / "splat.ply").read_bytes()
+
+
+def kinds(run: Path) -> list[str]:
+    return [event["kind"] for event in read_events(run / "events.jsonl")[0]]
+
+
+def act_at(monkeypatch: pytest.MonkeyPatch, step: int, act) -> None:
+    """Call `act` in the middle of a step."""
+    original = Trainer._update
+
+    def update(trainer: Trainer, *args) -> None:
+        if trainer.step == step:
+            act()
+        original(trainer, *args)
+
+    monkeypatch.setattr(Trainer, "_update", update)
+
+
+def test_the_runs_differ_from_each_other(whole: dict[str, bytes]) -> None:
+    assert len(set(whole.values())) == len(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_same_settings_give_the_same_bytes_for_any_number_of_threads(
+    name: str, dataset: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        config = replace(configs(dataset)[name], threads=2, checkpoint_every=0, preview_every=7)
+        assert run_bytes(config, tmp_path / "again") == whole[name]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_another_seed_gives_other_bytes(dataset: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    assert run_bytes(replace(configs(dataset)["adc"], seed=1), tmp_path / "run") != whole["adc"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("step", [3, 16])
+def test_stopped_then_resumed_is_the_run_that_was_never_stopped(
+    name: str, step: int, dataset: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, config = tmp_path / "run", configs(dataset)[name]
+    with monkeypatch.context() as patch:
+        act_at(patch, step, (run / "stop").touch)
+        result = train(config, run)
+    assert (result.stopped, result.steps, kinds(run)[-1]) == (True, step, "stopped")
+    assert (run / "splat.ply").read_bytes() != whole[name]
+    assert run_bytes(config, run, resume=True) == whole[name]
+    assert kinds(run)[-1] == "done"
+    assert not (run / "stop").exists()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("step", [5, 11, 30])
+def test_dead_in_the_middle_of_a_step_then_resumed(
+    name: str, step: int, dataset: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die() -> None:
+        raise Killed
+
+    run, config = tmp_path / "run", configs(dataset)[name]
+    with monkeypatch.context() as patch:
+        act_at(patch, step, die)
+        with pytest.raises(Killed):
+            train(config, run)
+    assert not (run / "splat.ply").exists()
+    assert run_bytes(config, run, resume=True) == whole[name]
+    assert kinds(run).count("started") == 2
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_killed_then_resumed(moment: str, dataset: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    run, config = tmp_path / "run", configs(dataset)["few views"]
+    file = tmp_path / "config.json"
+    file.write_text(json.dumps(config.to_dict()))
+    done = subprocess.run([sys.executable, str(KILLED_RUN), str(file), str(run), moment], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert not {"done", "stopped", "error"} & set(kinds(run))
+    leftovers = [path.name for path in run.rglob(".*.tmp")]
+    assert bool(leftovers) == ("config.json" in moment or "renaming" in moment)
+    assert run_bytes(config, run, resume=True) == whole["few views"]
+    assert list(run.rglob(".*.tmp")) == []  # nothing half-written is left
+
+
+def test_a_broken_checkpoint_is_told_and_the_one_before_is_used(
+    dataset: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    run, config = tmp_path / "run", configs(dataset)["adc"]
+    train(config, run)
+    newest, older = saved(run / "checkpoints")
+    newest.write_bytes(newest.read_bytes()[:-100])
+    (run / "splat.ply").unlink()
+    assert run_bytes(config, run, resume=True) == whole["adc"]
+    events, _ = read_events(run / "events.jsonl")
+    warnings = [event["message"] for event in events if event["kind"] == "warning"]
+    assert any(newest.name in message for message in warnings)
+    restarted = [event["step"] for event in events if event["kind"] == "started"]
+    assert restarted == [0, read_checkpoint(older).meta["step"]]
+
+
+def test_a_finished_run_resumed_is_left_as_it_is(dataset: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+    run, config = tmp_path / "run", configs(dataset)["adc"]
+    first = train(config, run)
+    again = train(config, run, resume=True)
+    assert (run / "splat.ply").read_bytes() == whole["adc"]
+    assert again.steps == first.steps == config.iterations
+    assert not again.stopped
+
+
+def test_other_settings_are_refused_on_resume_but_threads_may_change(dataset: Path, tmp_path: Path) -> None:
+    run, config = tmp_path / "run", configs(dataset)["adc"]
+    train(config, run)
+    before = (run / "events.jsonl").read_bytes()
+    with pytest.raises(UsageError, match=r"`density.growth` was 1.05, now 1.5"):
+        train(replace(config, density=replace(config.density, growth=1.5)), run, resume=True)
+    assert (run / "config.json").exists()
+    assert (run / "events.jsonl").read_bytes().startswith(before)
+    train(replace(config, threads=3, preview_every=0), run, resume=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_the_step_finish_and_saves(
+    number: signal.Signals, dataset: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, config = tmp_path / "run", configs(dataset)["adc"]
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        act_at(patch, 8, lambda: signal.raise_signal(number))
+        result = train(config, run)
+    assert (result.stopped, result.steps) == (True, 8)
+    assert signal.getsignal(number) is before
+    assert run_bytes(config, run, resume=True) == whole["adc"]
+
+
+def test_a_second_interrupt_does_not_wait(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def twice() -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    act_at(monkeypatch, 8, twice)
+    with pytest.raises(KeyboardInterrupt):
+        train(configs(dataset)["adc"], tmp_path / "run")
+    events, _ = read_events(tmp_path / "run" / "events.jsonl")
+    assert (events[-1]["kind"], events[-1]["exit_code"]) == ("error", 130)
+
+
+def test_early_end_is_remembered(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop.schedule.Flatness, "update", lambda self, loss: True)
+    config = replace(configs(dataset)["coarse to fine"], optimizer=replace(tiny_config(dataset).optimizer, sh_degree=0))
+    first = train(config, tmp_path / "run")
+    assert first.steps == 26  # the first step after refine_stop
+    assert not first.stopped
+    again = train(config, tmp_path / "run", resume=True)
+    assert again.steps == 26
