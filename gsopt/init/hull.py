@@ -107,32 +107,40 @@ def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0
 
     With a `radius` (scene units) a point counts as solid when anything within it may be.
     """
-    alive = torch.arange(len(points))
+    alive, here = torch.arange(len(points)), points
     shown = torch.zeros(len(points), dtype=torch.int32)
     for photo in photos:
-        here = points[alive]
         column, row, depth = project(photo.camera, here)
         visible = inside(photo.camera, column, row, depth)
         alpha = _widened(photo, radius, depth[visible]) if radius else photo.alpha()
-        solid = torch.ones(len(alive), dtype=torch.bool)
-        solid[visible] = sample(alpha, column[visible], row[visible])[0] > _SOLID
-        shown[alive] += visible.int()
-        alive = alive[solid]
+        column, row = (torch.where(visible, coordinate, 0.0) for coordinate in (column, row))  # no NaN to sample at
+        rows = torch.nonzero((sample(alpha, column, row)[0] > _SOLID) | ~visible)[:, 0]
+        alive, here = alive.index_select(0, rows), here.index_select(0, rows)
+        shown = shown.index_select(0, rows) + visible.index_select(0, rows)
     kept = torch.zeros(len(points), dtype=torch.bool)
-    kept[alive] = 2 * shown[alive] >= len(photos)
+    kept[alive] = 2 * shown >= len(photos)
     return kept
 
 
 def _widened(photo: Photo, radius: float, depths: Float[Tensor, "M"]) -> Float[Tensor, "1 H W"]:
     """Alpha spread by what `radius` covers at the median depth, px."""
+    alpha = photo.alpha()
     if len(depths) == 0:
-        return photo.alpha()
+        return alpha
     reach = radius * float(photo.camera.Ks[0].diagonal()[:2].max()) / float(depths.median())
-    pixels = min(math.ceil(reach), max(photo.planes.shape[1:]))
-    alpha = photo.alpha()[None]
-    for shape in ((2 * pixels + 1, 1), (1, 2 * pixels + 1)):
-        alpha = torch.nn.functional.max_pool2d(alpha, shape, stride=1, padding=(shape[0] // 2, shape[1] // 2))
-    return alpha[0]
+    pixels = min(math.ceil(reach), max(alpha.shape[1:]))
+    return _spread(_spread(alpha, pixels).mT, pixels).mT.contiguous()
+
+
+def _spread(planes: Float[Tensor, "1 H W"], reach: int) -> Float[Tensor, "1 H W"]:
+    """Running maximum along the rows over `reach` pixels to either side, the window doubled at each step."""
+    planes = torch.nn.functional.pad(planes, (reach, reach))
+    window = 1
+    while window < 2 * reach + 1:
+        step = min(window, 2 * reach + 1 - window)
+        planes = torch.maximum(planes[..., :-step], planes[..., step:])
+        window += step
+    return planes
 
 
 def _sample_points(grid: Grid, photos: list[Photo], count: int, generator: torch.Generator) -> Float[Tensor, "N 3"]:
