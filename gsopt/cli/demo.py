@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
 
     from gsopt.cli import train
 
-    code = train.main(["-s", str(SCENE), "-m", str(run), "--iterations", str(flags.iterations)])
+    code = train.main([str(SCENE), "-m", str(run), "--iterations", str(flags.iterations)])
     report = run / "report.html"
     if code == 0 and report.is_file():
         print(f"Open {report.resolve()} in a browser; `gsopt view {run}` shows the splats.")

@@ -79,7 +79,7 @@ def says_what_got_do(text: str) -> bool:
     return len(sentences) >= 2
 
 
-def raises(tree: ast.Module) -> Iterator[tuple[str, ast.Call]]:
+def raises(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name):
             yield node.exc.func.id, node.exc
@@ -103,9 +103,15 @@ def caught_in_place(tree: ast.Module) -> set[ast.Call]:
     return caught
 
 
+def in_private_functions(tree: ast.Module) -> set[ast.Call]:
+    """Errors of functions named _so, which the public function that calls them turns into something else."""
+    functions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and re.match("_[^_]", node.name))
+    return {call for function in functions for _, call in raises(function)}
+
+
 def foreign_raises(tree: ast.Module) -> Iterator[str]:
-    """Exceptions of Python that reach a caller, who should get a GsoptError."""
-    inside = caught_in_place(tree)
+    """Exceptions of Python that a public function raises, where its caller should get a GsoptError."""
+    inside = caught_in_place(tree) | in_private_functions(tree)
     for kind, call in raises(tree):
         if kind.endswith("Error") and kind not in ERRORS | OTHER_RAISES and call not in inside:
             yield kind
@@ -148,7 +154,7 @@ def test_gsopt_raises_its_own_errors(root: Path, tracked: list[Path]) -> None:
         (banned, "torch.load(path)"),
         (curt_messages, "raise UsageError('Bad value')"),
         (curt_messages, "raise InputError(f'Bad value, got {x}.')"),
-        (foreign_raises, "raise ValueError('x')"),
+        (foreign_raises, "def public():\n    raise ValueError('x')"),
         (foreign_raises, "try:\n    raise ValueError('x')\nexcept OSError:\n    pass"),
         (long_functions, "def f():\n" + "    x = 1\n" * 41),
     ],
@@ -162,6 +168,7 @@ def test_a_rule_notices_what_breaks_it(rule, source: str) -> None:
     [
         (banned, "model.eval()\nnp.load(path, allow_pickle=False)\nevaluate(x)"),
         (curt_messages, "raise UsageError(f'`--n` must be at least 1, got {n}. Drop the flag.')"),
+        (foreign_raises, "def _private():\n    raise ValueError('x')"),
         (foreign_raises, "raise\nraise error\nraise InputError('x')"),
         (
             foreign_raises,
