@@ -1,4 +1,4 @@
-// Stage 3: front-to-back compositing. A block's 16 pixels keep their state in registers while its splats stream by.
+// Stage 3: front-to-back compositing. A block's pixels keep their state in registers while its splats stream by.
 #pragma once
 #include "parallel.h"
 #include "tile.h"
@@ -6,8 +6,8 @@
 namespace gsopt::GSOPT_ISA {
 
 struct BlockState {
-  f16 T, r, g, b, depth;
-  i16 last;
+  px T, r, g, b, depth;
+  pxi last;
 };
 
 struct alignas(64) StoredState {
@@ -16,44 +16,44 @@ struct alignas(64) StoredState {
 };
 
 inline BlockState load_state(const StoredState& s) {
-  return {load16(s.T), load16(s.r), load16(s.g), load16(s.b), load16(s.depth), load16i(s.last)};
+  return {load_px(s.T), load_px(s.r), load_px(s.g), load_px(s.b), load_px(s.depth), load_pxi(s.last)};
 }
 inline void store_state(StoredState& s, const BlockState& v) {
-  store16(s.T, v.T), store16(s.r, v.r), store16(s.g, v.g), store16(s.b, v.b), store16(s.depth, v.depth);
-  store16i(s.last, v.last);
+  store_px(s.T, v.T), store_px(s.r, v.r), store_px(s.g, v.g), store_px(s.b, v.b), store_px(s.depth, v.depth);
+  store_pxi(s.last, v.last);
 }
 
 // Blends the splats named by `words` into one block; false once every pixel has terminated.
-template <bool Depth>
-inline bool blend_block(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, StoredState& stored) {
-  f16 X, Y;
+// Blends the splats named by `words` into one block; false once every pixel has terminated.
+template <bool Depth, bool Count>
+inline bool blend_block(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, StoredState& stored,
+                        Work& work) {
+  px X, Y;
   block_pixels(block, X, Y);
   BlockState s = load_state(stored);
-  const f16 t_min = splat<f16>(kTransmittanceMin), threshold = splat<f16>(kLog2AlphaMin), alpha_max = splat<f16>(kAlphaMax);
-  i16 alive = s.T > t_min;
+  const px t_min = splat<px>(kTransmittanceMin), threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
+  pxi alive = s.T > t_min, last = splat_pxi(0);  // one-based within the chunk, 0 = none
   for (int w = 0; w < n_words; ++w) {
     for (uint64_t rest = words[w][block]; rest; rest &= rest - 1) {
       const int j = 64 * w + __builtin_ctzll(rest);
-      const f16 u = splat<f16>(local.A[j]) * X + (splat<f16>(local.B[j]) * Y + splat<f16>(local.u0[j]));
-      const f16 v = splat<f16>(local.C[j]) * Y + splat<f16>(local.v0[j]);
-      const f16 e = splat<f16>(local.log2_opacity[j]) - u * u - v * v;
-      const i16 pass = (e >= threshold) & alive;
-      const f16 weight = keep(pass, min(exp2(e), alpha_max)) * s.T;
-      s.r = s.r + weight * splat<f16>(local.r[j]);
-      s.g = s.g + weight * splat<f16>(local.g[j]);
-      s.b = s.b + weight * splat<f16>(local.b[j]);
-      if (Depth) s.depth = s.depth + weight * splat<f16>(local.depth[j]);
+      const Exponent x = exponent(local, j, X, Y);
+      const pxi pass = (x.e >= threshold) & alive;
+      const px weight = keep(pass, min(exp2(x.e), alpha_max)) * s.T;
+      s.r = s.r + weight * splat<px>(local.r[j]);
+      s.g = s.g + weight * splat<px>(local.g[j]);
+      s.b = s.b + weight * splat<px>(local.b[j]);
+      if (Depth) s.depth = s.depth + weight * splat<px>(local.depth[j]);
       s.T = s.T - weight;
-      s.last = select(pass, splat16i(first + j), s.last);
+      last = max(last, pass & splat_pxi(kOneBased.at[j]));
+      if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(pass));
       alive = s.T > t_min;
-      if (!any(alive)) {
-        store_state(stored, s);
-        return false;
-      }
+      if (!any(alive)) goto done;
     }
   }
+done:
+  s.last = max(s.last, (last > splat_pxi(0)) & (last + splat_pxi(first - 1)));
   store_state(stored, s);
-  return true;
+  return any(alive);
 }
 
 inline void write_block(const Frame& frame, const ForwardOutput& out, int tile, int block, const StoredState& s) {
@@ -68,7 +68,7 @@ inline void write_block(const Frame& frame, const ForwardOutput& out, int tile, 
   });
 }
 
-template <bool Depth> inline void blend_tile(const Frame& frame, int tile, const ForwardOutput& out) {
+template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int tile, const ForwardOutput& out, Work& work) {
   const uint32_t begin = frame.tile_begin.as<uint32_t>()[tile], end = frame.tile_begin.as<uint32_t>()[tile + 1];
   auto* words = reinterpret_cast<uint64_t(*)[kBlocks]>(frame.words.as<uint64_t>()) + frame.word_begin.as<uint32_t>()[tile];
   const TileGeometry geometry = tile_geometry(frame, tile);
@@ -78,13 +78,13 @@ template <bool Depth> inline void blend_tile(const Frame& frame, int tile, const
     for_each_pixel(frame, tile, block, [&](int64_t, int lane) { state[block].T[lane] = 1.f; });
   }
   Local local;
-  unsigned alive = (1u << kBlocks) - 1;
+  uint32_t alive = static_cast<uint32_t>((uint64_t{1} << kBlocks) - 1);
   for (uint32_t first = begin; first < end && alive; first += kChunk) {
     const int n = end - first < kChunk ? static_cast<int>(end - first) : kChunk, n_words = (n + 63) / 64;
     load_chunk(frame, frame.entries.as<Entry>() + first, n, geometry, local, words);
-    for (unsigned rest = alive; rest; rest &= rest - 1) {
+    for (uint32_t rest = alive; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest);
-      if (!blend_block<Depth>(local, words, n_words, block, static_cast<int>(first - begin), state[block])) alive &= ~(1u << block);
+      if (!blend_block<Depth, Count>(local, words, n_words, block, static_cast<int>(first - begin), state[block], work)) alive &= ~(1u << block);
     }
     words += n_words;
   }
@@ -98,8 +98,11 @@ template <bool Depth> inline void blend_tile(const Frame& frame, int tile, const
 }
 
 inline void blend_stage(Pool& pool, Frame& frame, const ForwardOutput& out) {
-  parallel(pool, frame.tiles(), [&](int tile, int) {
-    out.depths ? blend_tile<true>(frame, tile, out) : blend_tile<false>(frame, tile, out);
+  const auto blend = out.work ? (out.depths ? blend_tile<true, true> : blend_tile<false, true>)
+                              : (out.depths ? blend_tile<true, false> : blend_tile<false, false>);
+  parallel(pool, frame.tiles(), [&](int tile, int worker) {
+    Work none;
+    blend(frame, tile, out, out.work ? out.work[worker] : none);
   });
 }
 

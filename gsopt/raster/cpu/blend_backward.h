@@ -5,7 +5,7 @@
 // T is recovered by dividing by 1 - alpha; it never falls below what the forward pass stopped at.
 //
 // Per block the work has two phases: pixels as lanes compute s and w for eight splats, then splats as lanes sum them
-// over the 16 pixels into moments about the tile's centre. Each (splat, tile) pair owns one row of sums, so no two
+// over the pixels into moments about the tile's centre. Each (splat, tile) pair owns one row of sums, so no two
 // threads ever add to the same number and the result does not depend on their order.
 #pragma once
 #include "parallel.h"
@@ -43,28 +43,30 @@ struct alignas(64) Batch {
   int size = 0;
 };
 
-// 16 rows of 8 splats x 16 pixels become, per pixel, one vector over the splats.
+// Rows of pixels, one per splat, become one vector over the splats per pixel.
 inline void pixels_by_splat(const float rows[kLanes][kPixels], f8 out[kPixels]) {
-  for (int h = 0; h < 2; ++h) {
-    for (int l = 0; l < kLanes; ++l) out[8 * h + l] = load8(rows[l] + 8 * h);
-    transpose8(out + 8 * h);
+  for (int p = 0; p < kPixels; p += kLanes) {
+    for (int l = 0; l < kLanes; ++l) out[p + l] = load8(rows[l] + p);
+    transpose8(out + p);
   }
 }
 
-// Σ s, Σ s x, Σ s y, Σ s x², Σ s x y, Σ s y² over a block; x, y relative to the block's centre (±0.5, ±1.5).
+// Σ s, Σ s x, Σ s y, Σ s x², Σ s x y, Σ s y² over a block; x, y relative to the block's center (±0.5, ±1.5).
 inline void block_moments(const f8 s[kPixels], f8 m[6]) {
-  f8 column[4], tilted[4], outer = splat<f8>(0.f), inner = outer;
+  f8 column[4], tilted[4], curved = splat<f8>(0.f);
   for (int x = 0; x < 4; ++x) {
-    const f8 o = s[x] + s[12 + x], i = s[4 + x] + s[8 + x];
-    outer += o, inner += i, column[x] = o + i;
-    tilted[x] = (s[12 + x] - s[x]) * 1.5f + (s[8 + x] - s[4 + x]) * 0.5f;
+    column[x] = tilted[x] = splat<f8>(0.f);
+    for (int row = 0; row < kBlockRows; ++row) {
+      const float y = static_cast<float>(row) - 0.5f * (kBlockRows - 1);
+      column[x] += s[4 * row + x], tilted[x] += s[4 * row + x] * y, curved += s[4 * row + x] * (y * y);
+    }
   }
-  m[0] = outer + inner;
+  m[0] = (column[0] + column[1]) + (column[2] + column[3]);
   m[1] = (column[3] - column[0]) * 1.5f + (column[2] - column[1]) * 0.5f;
   m[2] = (tilted[0] + tilted[1]) + (tilted[2] + tilted[3]);
   m[3] = (column[0] + column[3]) * 2.25f + (column[1] + column[2]) * 0.25f;
   m[4] = (tilted[3] - tilted[0]) * 1.5f + (tilted[2] - tilted[1]) * 0.5f;
-  m[5] = outer * 2.25f + inner * 0.25f;
+  m[5] = kBlockRows == 2 ? m[0] * 0.25f : curved;
 }
 
 // Phase two: sums of a batch over the block, moved to the tile's centre and added to the splats' rows.
@@ -78,7 +80,8 @@ inline void flush(Batch& batch, const BlockGradient& grad, int block, float (*ro
   f8 pixel[kPixels], out[8], blue = splat<f8>(0.f), depth = blue;
   pixels_by_splat(batch.s, pixel);
   block_moments(pixel, out);
-  const float bx = static_cast<float>(4 * (block % 4)) - 6.f, by = static_cast<float>(4 * (block / 4)) - 6.f;
+  const float bx = static_cast<float>(4 * (block % 4)) - 6.f;
+  const float by = static_cast<float>(kBlockRows * (block / 4)) + 0.5f * kBlockRows - 8.f;
   out[3] += (out[1] * 2.f + out[0] * bx) * bx;
   out[4] += out[2] * bx + (out[1] + out[0] * bx) * by;
   out[5] += (out[2] * 2.f + out[0] * by) * by;
@@ -105,12 +108,12 @@ inline void flush(Batch& batch, const BlockGradient& grad, int block, float (*ro
 template <bool Depth, bool Abs>
 inline void blend_block_backward(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first,
                                  BlockGradient& grad, float (*rows)[kRow]) {
-  f16 X, Y;
+  px X, Y;
   block_pixels(block, X, Y);
-  f16 T = load16(grad.T), behind = load16(grad.behind);
-  const f16 gr = load16(grad.r), gg = load16(grad.g), gb = load16(grad.b), gz = load16(grad.depth);
-  const i16 last = load16i(grad.last);
-  const f16 threshold = splat<f16>(kLog2AlphaMin), alpha_max = splat<f16>(kAlphaMax), one = splat<f16>(1.f);
+  px T = load_px(grad.T), behind = load_px(grad.behind);
+  const px gr = load_px(grad.r), gg = load_px(grad.g), gb = load_px(grad.b), gz = load_px(grad.depth);
+  const pxi last = load_pxi(grad.last);
+  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax), one = splat<px>(1.f);
   Batch batch;
   for (int w = n_words - 1; w >= 0; --w) {
     uint64_t rest = words[w][block];
@@ -119,31 +122,29 @@ inline void blend_block_backward(const Local& local, const uint64_t (*words)[kBl
     while (rest) {
       const int bit = 63 - __builtin_clzll(rest), j = 64 * w + bit;
       rest ^= uint64_t{1} << bit;
-      const f16 u = splat<f16>(local.A[j]) * X + (splat<f16>(local.B[j]) * Y + splat<f16>(local.u0[j]));
-      const f16 v = splat<f16>(local.C[j]) * Y + splat<f16>(local.v0[j]);
-      const f16 e = splat<f16>(local.log2_opacity[j]) - u * u - v * v;
-      const i16 pass = (e >= threshold) & (last >= splat16i(first + j));
-      const f16 raw = exp2(e);
-      const f16 alpha = keep(pass, min(raw, alpha_max));
+      const auto [u, v, e] = exponent(local, j, X, Y);
+      const pxi pass = (e >= threshold) & (last >= splat_pxi(first + j));
+      const px raw = exp2(e);
+      const px alpha = keep(pass, min(raw, alpha_max));
       T = T * (one / (one - alpha));
-      const f16 weight = alpha * T;
-      f16 q = splat<f16>(local.r[j]) * gr + splat<f16>(local.g[j]) * gg + splat<f16>(local.b[j]) * gb;
-      if (Depth) q = q + splat<f16>(local.depth[j]) * gz;
-      const f16 difference = q - behind;
+      const px weight = alpha * T;
+      px q = splat<px>(local.r[j]) * gr + splat<px>(local.g[j]) * gg + splat<px>(local.b[j]) * gb;
+      if (Depth) q = q + splat<px>(local.depth[j]) * gz;
+      const px difference = q - behind;
       behind = behind + alpha * difference;
-      const f16 s = keep(raw < alpha_max, weight * difference);  // a clamped alpha does not move
+      const px s = keep(raw < alpha_max, weight * difference);  // a clamped alpha does not move
       const int k = batch.size;
       batch.index[k] = j;
-      store16(batch.s[k], s), store16(batch.w[k], weight);
+      store_px(batch.s[k], s), store_px(batch.w[k], weight);
       if (Abs) {
         batch.abs_x[k] = sum(abs(s * u)) * local.A[j] * (1.f / kHalfLog2E);
-        batch.abs_y[k] = sum(abs(s * (splat<f16>(local.B[j]) * u + splat<f16>(local.C[j]) * v))) * (1.f / kHalfLog2E);
+        batch.abs_y[k] = sum(abs(s * (splat<px>(local.B[j]) * u + splat<px>(local.C[j]) * v))) * (1.f / kHalfLog2E);
       }
       if (++batch.size == kLanes) flush<Depth, Abs>(batch, grad, block, rows);
     }
   }
   flush<Depth, Abs>(batch, grad, block, rows);
-  store16(grad.T, T), store16(grad.behind, behind);
+  store_px(grad.T, T), store_px(grad.behind, behind);
 }
 
 // Moments about the tile's centre become moments about each splat's own centre; the rows go to their slots.

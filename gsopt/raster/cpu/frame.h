@@ -10,7 +10,6 @@
 namespace gsopt {
 
 constexpr int kTile = 16;         // pixels along a tile's side
-constexpr int kBlocks = 16;       // 4x4-pixel blocks in a tile
 constexpr int kChunk = 256;       // splats of a tile that are worked on at once
 constexpr int kProjectChunk = 1024;
 
@@ -71,16 +70,22 @@ struct Frame {
   Buffer tile_begin;         // uint32[tiles + 1]: first entry of a tile
   Buffer word_begin;         // uint32[tiles + 1]: first mask word of a tile
   Buffer entries;            // Entry[intersections]
-  Buffer words;              // uint64[words][kBlocks]: bit k of word w: does splat 64 w + k touch the block?
-  Buffer transmittance;      // float[tiles][kBlocks][16]
-  Buffer last;               // int32[tiles][kBlocks][16]: last contributing entry of the tile, -1 if none
+  Buffer words;              // uint64[words][blocks]: bit k of word w: does splat 64 w + k touch the block?
+  Buffer transmittance;      // float[tiles][blocks][pixels]
+  Buffer last;               // int32[tiles][blocks][pixels]: last contributing entry of the tile, -1 if none
   Buffer rows;               // float[intersections][kRow]
   int tiles() const { return tiles_x * tiles_y; }
+};
+
+// What a frame cost: (splat, block) pairs looked at, and (splat, pixel) pairs that contributed.
+struct alignas(64) Work {
+  int64_t entries = 0, pairs = 0;
 };
 
 struct ForwardOutput {
   float *colors, *alphas, *depths;  // [H,W,3], [H,W], [H,W] or null
   int32_t* radii;                   // [N,2]
+  Work* work;                       // one per thread, or null: do not count
 };
 
 struct BackwardInput {

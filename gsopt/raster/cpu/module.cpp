@@ -1,13 +1,16 @@
 // The Python side of the CPU kernels: arrays in and out by DLPack, no torch, the GIL released while kernels run.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <chrono>
 #include <cmath>
 #include <cstdlib>
+#include <map>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -64,8 +67,17 @@ struct Workspace {
   Pool pool;
   const Kernels* kernels;
   Buffer scratch;
+  bool count_work = false;
+  Work work;                              // summed over frames while count_work is set
+  std::map<std::string, double> seconds;  // wall time per stage since construction
   Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) {}
 };
+
+template <class Stage> void timed(Workspace& ws, const char* name, Stage&& stage) {
+  const auto start = std::chrono::steady_clock::now();
+  stage();
+  ws.seconds[name] += std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
 
 template <class Array> auto* data_of(const Array& a, size_t size, const char* name) {
   if (a.size() != size) throw std::invalid_argument(std::string(name) + ": wrong number of elements");
@@ -124,11 +136,13 @@ void reserve_frame(Frame& f, int64_t n) {
 
 void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, const Camera& camera, std::tuple<float, float, float> background,
              Out colors, Out alphas, std::optional<Out> depths, OutInt radii) {
+  std::vector<Work> work(ws.count_work ? ws.pool.threads() : 0);
   const Parameters P = parameters_of(model, sh_degree);
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
   const ForwardOutput out = {data_of(colors, 3 * pixels, "colors"), data_of(alphas, pixels, "alphas"),
                              depths ? data_of(*depths, pixels, "depths") : nullptr,
-                             data_of(radii, 2 * static_cast<size_t>(P.count), "radii")};
+                             data_of(radii, 2 * static_cast<size_t>(P.count), "radii"),
+                             ws.count_work ? work.data() : nullptr};
   nb::gil_scoped_release release;
   frame.camera = camera;
   frame.background[0] = std::get<0>(background), frame.background[1] = std::get<1>(background), frame.background[2] = std::get<2>(background);
@@ -136,9 +150,10 @@ void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, con
   frame.tiles_x = (camera.width + kTile - 1) / kTile, frame.tiles_y = (camera.height + kTile - 1) / kTile;
   if (frame.tiles_x > 65535 || frame.tiles_y > 65535) throw std::invalid_argument("the image is wider or higher than 1,048,560 pixels");
   reserve_frame(frame, P.count);
-  ws.kernels->project(ws.pool, frame, P, out.radii);
-  ws.kernels->bin(ws.pool, frame);
-  ws.kernels->blend(ws.pool, frame, out);
+  timed(ws, "project", [&] { ws.kernels->project(ws.pool, frame, P, out.radii); });
+  timed(ws, "bin", [&] { ws.kernels->bin(ws.pool, frame); });
+  timed(ws, "blend", [&] { ws.kernels->blend(ws.pool, frame, out); });
+  for (const Work& w : work) ws.work.entries += w.entries, ws.work.pairs += w.pairs;
 }
 
 struct Gradient {
@@ -162,8 +177,8 @@ void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std:
                                   g.means2d_abs ? data_of(*g.means2d_abs, 2 * n, "v_means2d_abs") : nullptr};
   nb::gil_scoped_release release;
   frame.rows.reserve(sizeof(float) * kRow * frame.intersections);
-  ws.kernels->blend_backward(ws.pool, frame, in, out.means2d_abs != nullptr);
-  ws.kernels->project_backward(ws.pool, frame, P, out);
+  timed(ws, "blend_backward", [&] { ws.kernels->blend_backward(ws.pool, frame, in, out.means2d_abs != nullptr); });
+  timed(ws, "project_backward", [&] { ws.kernels->project_backward(ws.pool, frame, P, out); });
 }
 
 std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Out v_rendered, int height, int width, float lambda_dssim) {
@@ -171,7 +186,7 @@ std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Ou
   PhotometricArguments a = {data_of(rendered, size, "rendered"), data_of(target, size, "target"), data_of(v_rendered, size, "v_rendered"),
                             height, width, lambda_dssim, &ws.scratch, 0, 0};
   nb::gil_scoped_release release;
-  ws.kernels->photometric(ws.pool, a);
+  timed(ws, "photometric", [&] { ws.kernels->photometric(ws.pool, a); });
   return {a.l1, a.ssim};
 }
 
@@ -184,7 +199,7 @@ void adam(Workspace& ws, Out param, In grad, Out exp_avg, Out exp_avg_sq, int64_
                            rows, static_cast<int64_t>(size) / rows, active, static_cast<float>(lr / c1), static_cast<float>(beta1),
                            static_cast<float>(beta2), static_cast<float>(1.0 / std::sqrt(c2)), static_cast<float>(eps)};
   nb::gil_scoped_release release;
-  ws.kernels->adam(ws.pool, a);
+  timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
 }
 
 }  // namespace
@@ -199,6 +214,9 @@ NB_MODULE(_cpu, m) {
   nb::class_<Workspace>(m, "Workspace")
       .def(nb::init<int, const std::string&>(), nb::arg("threads"), nb::arg("isa"))
       .def_prop_ro("isa", [](const Workspace& w) { return std::string(w.kernels->name); })
+      .def_ro("seconds", &Workspace::seconds)
+      .def_rw("count_work", &Workspace::count_work)
+      .def_prop_ro("work", [](const Workspace& w) { return std::tuple(w.work.entries, w.work.pairs); })
       .def_prop_ro("threads", [](const Workspace& w) { return w.pool.threads(); });
   nb::class_<Frame>(m, "Frame")
       .def(nb::init<>())

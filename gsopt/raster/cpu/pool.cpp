@@ -5,6 +5,10 @@
 #if defined(__x86_64__)
 #include <immintrin.h>
 #endif
+#if defined(__linux__)
+#include <pthread.h>
+#include <sched.h>
+#endif
 
 namespace gsopt {
 namespace {
@@ -32,6 +36,12 @@ template <class Ready> bool spin(Ready ready) {
 }  // namespace
 
 Pool::Pool(int threads) {
+#if defined(__linux__)
+  cpu_set_t allowed;
+  if (sched_getaffinity(0, sizeof(allowed), &allowed) == 0 && CPU_COUNT(&allowed) >= threads)
+    for (int core = 0; core < CPU_SETSIZE; ++core)
+      if (CPU_ISSET(core, &allowed)) cores_.push_back(core);
+#endif
   for (int k = 1; k < threads; ++k) workers_.emplace_back([this, k] { work(k); });
 }
 
@@ -57,6 +67,9 @@ void Pool::run(int items, Task task, void* context) {
     items_ = items;
     task_ = task;
     context_ = context;
+#if defined(__linux__)
+    caller_core_ = sched_getcpu();
+#endif
     next_.store(0, std::memory_order_relaxed);
     busy_.store(static_cast<int>(workers_.size()), std::memory_order_relaxed);
     generation_.fetch_add(1, std::memory_order_release);
@@ -70,9 +83,29 @@ void Pool::take(int worker) {
   for (int k; (k = next_.fetch_add(1, std::memory_order_relaxed)) < items_;) task_(context_, k, worker);
 }
 
+// Schedulers have been seen to leave a worker on its caller's core while others idle, which costs half the speed:
+// the k-th worker moves to the k-th core after the caller's whenever the caller has moved.
+void Pool::leave_core_of_caller(int worker, int& pinned) const {
+#if defined(__linux__)
+  for (size_t k = 0; k < cores_.size(); ++k) {
+    if (cores_[k] != caller_core_) continue;
+    const int core = cores_[(k + worker) % cores_.size()];
+    if (core == pinned) return;
+    cpu_set_t one;
+    CPU_ZERO(&one);
+    CPU_SET(core, &one);
+    if (pthread_setaffinity_np(pthread_self(), sizeof(one), &one) == 0) pinned = core;
+    return;
+  }
+#else
+  (void)worker, (void)pinned;
+#endif
+}
+
 // The generation starts at 0 whatever the time at which this thread first runs, so no wake-up is lost.
 void Pool::work(int worker) {
   uint64_t seen = 0;
+  int pinned = -1;
   for (;;) {
     if (!spin([&] { return generation_.load(std::memory_order_acquire) != seen; })) {
       std::unique_lock lock(mutex_);
@@ -83,6 +116,7 @@ void Pool::work(int worker) {
       seen = generation_.load(std::memory_order_acquire);
       if (stop_) return;
     }
+    leave_core_of_caller(worker, pinned);
     take(worker);
     busy_.fetch_sub(1, std::memory_order_release);
   }

@@ -27,6 +27,7 @@ class Pool {
 
  private:
   void work(int worker);
+  void leave_core_of_caller(int worker, int& pinned) const;
   void take(int worker);
 
   std::vector<std::thread> workers_;
@@ -37,6 +38,8 @@ class Pool {
   int items_ = 0;
   Task task_ = nullptr;
   void* context_ = nullptr;
+  int caller_core_ = -1;
+  std::vector<int> cores_;  // cores this process may use; empty where the system does not tell
   bool stop_ = false;
 };
 

@@ -1,5 +1,5 @@
-// Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the
-// language has no operator. 8 lanes hold Gaussians, 16 lanes hold the pixels of a 4x4 block.
+// Vectors of 4, 8 and, with AVX-512, 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the
+// language has no operator. 8 lanes hold Gaussians; 8 or 16 hold the pixels of a block.
 // Included once per instruction set; everything lives in that set's own namespace.
 #pragma once
 #include <cmath>
@@ -19,8 +19,7 @@ using f4u = float __attribute__((vector_size(16), aligned(4), may_alias));
 using f8u = float __attribute__((vector_size(32), aligned(4), may_alias));
 using i8u = int32_t __attribute__((vector_size(32), aligned(4), may_alias));
 
-constexpr int kLanes = 8;    // Gaussians per vector
-constexpr int kPixels = 16;  // pixels per block
+constexpr int kLanes = 8;  // Gaussians per vector
 
 inline f4 load4(const float* p) { return *reinterpret_cast<const f4u*>(p); }
 inline void store4(float* p, f4 v) { *reinterpret_cast<f4u*>(p) = v; }
@@ -39,12 +38,13 @@ inline i8 bits(f8 v) { return (i8)v; }
 inline f8 from_bits(i8 v) { return (f8)v; }
 inline i8 to_int(f8 v) { return __builtin_convertvector(v, i8); }  // truncates
 inline f8 to_float(i8 v) { return __builtin_convertvector(v, f8); }
-inline f8 select(i8 m, f8 a, f8 b) { return m ? a : b; }
 inline f8 keep(i8 m, f8 a) { return (f8)(m & (i8)a); }  // a where m, else +0
 inline f8 abs(f8 a) { return (f8)((i8)a & splat8i(0x7fffffff)); }
 
 #if defined(__AVX2__)
 inline int movemask(i8 m) { return _mm256_movemask_ps((__m256)m); }
+inline i8 max(i8 a, i8 b) { return (i8)_mm256_max_epi32((__m256i)a, (__m256i)b); }
+inline f8 select(i8 m, f8 a, f8 b) { return (f8)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)m); }
 inline f8 sqrt(f8 a) { return (f8)_mm256_sqrt_ps((__m256)a); }
 inline f8 min(f8 a, f8 b) { return (f8)_mm256_min_ps((__m256)a, (__m256)b); }
 inline f8 max(f8 a, f8 b) { return (f8)_mm256_max_ps((__m256)a, (__m256)b); }
@@ -55,6 +55,8 @@ inline int movemask(i8 m) {
   for (int k = 0; k < 8; ++k) r |= (m[k] < 0) << k;
   return r;
 }
+inline i8 max(i8 a, i8 b) { return a > b ? a : b; }
+inline f8 select(i8 m, f8 a, f8 b) { return m ? a : b; }
 inline f8 sqrt(f8 a) {
   f8 r;
   for (int k = 0; k < 8; ++k) r[k] = __builtin_sqrtf(a[k]);
@@ -68,6 +70,8 @@ inline i8 shift_left(i8 a, i8 n) { return a << n; }
 inline bool any(i8 m) { return movemask(m) != 0; }
 inline f8 clamp(f8 x, f8 lo, f8 hi) { return min(max(x, lo), hi); }
 
+inline float sum(f8 a) { return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7])); }
+
 // 16 pixels: one register of AVX-512, or two of 8 lanes. Masks are integers, all ones where true.
 #if defined(__AVX512F__)
 using f16 = float __attribute__((vector_size(64)));
@@ -75,20 +79,17 @@ using i16 = int32_t __attribute__((vector_size(64)));
 using f16u = float __attribute__((vector_size(64), aligned(4), may_alias));
 using i16u = int32_t __attribute__((vector_size(64), aligned(4), may_alias));
 template <> inline f16 splat<f16>(float x) { return f16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
-inline i16 splat16i(int32_t x) { return i16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
-inline f16 load16(const float* p) { return *reinterpret_cast<const f16u*>(p); }
-inline void store16(float* p, f16 v) { *reinterpret_cast<f16u*>(p) = v; }
-inline i16 load16i(const int32_t* p) { return *reinterpret_cast<const i16u*>(p); }
-inline void store16i(int32_t* p, i16 v) { *reinterpret_cast<i16u*>(p) = v; }
 inline i16 bits(f16 v) { return (i16)v; }
 inline f16 from_bits(i16 v) { return (f16)v; }
 inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
-inline i16 select(i16 m, i16 a, i16 b) { return m ? a : b; }
 inline f16 min(f16 a, f16 b) { return (f16)_mm512_min_ps((__m512)a, (__m512)b); }
-inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
-inline bool any(i16 m) { return _mm512_movepi32_mask((__m512i)m) != 0; }
+inline i16 max(i16 a, i16 b) { return (i16)_mm512_max_epi32((__m512i)a, (__m512i)b); }
+inline f16 abs(f16 a) { return (f16)_mm512_abs_ps((__m512)a); }
+inline int movemask(i16 m) { return _mm512_movepi32_mask((__m512i)m); }
+inline bool any(i16 m) { return movemask(m) != 0; }
 inline float sum(f16 a) { return _mm512_reduce_add_ps((__m512)a); }
 inline i16 shift_exponent(i16 n) { return n << 23; }
+
 #else
 struct i16 {
   i8 lo, hi;
@@ -105,26 +106,40 @@ inline i16 operator&(i16 a, i16 b) { return {a.lo & b.lo, a.hi & b.hi}; }
 inline i16 operator>(f16 a, f16 b) { return {a.lo > b.lo, a.hi > b.hi}; }
 inline i16 operator>=(f16 a, f16 b) { return {a.lo >= b.lo, a.hi >= b.hi}; }
 inline i16 operator<(f16 a, f16 b) { return {a.lo < b.lo, a.hi < b.hi}; }
+inline i16 operator>(i16 a, i16 b) { return {a.lo > b.lo, a.hi > b.hi}; }
 inline i16 operator>=(i16 a, i16 b) { return {a.lo >= b.lo, a.hi >= b.hi}; }
 template <> inline f16 splat<f16>(float x) { return {splat<f8>(x), splat<f8>(x)}; }
-inline i16 splat16i(int32_t x) { return {splat8i(x), splat8i(x)}; }
-inline f16 load16(const float* p) { return {load8(p), load8(p + 8)}; }
-inline void store16(float* p, f16 v) { store8(p, v.lo), store8(p + 8, v.hi); }
-inline i16 load16i(const int32_t* p) { return {load8i(p), load8i(p + 8)}; }
-inline void store16i(int32_t* p, i16 v) { store8i(p, v.lo), store8i(p + 8, v.hi); }
 inline i16 bits(f16 v) { return {bits(v.lo), bits(v.hi)}; }
 inline f16 from_bits(i16 v) { return {from_bits(v.lo), from_bits(v.hi)}; }
 inline f16 keep(i16 m, f16 a) { return {keep(m.lo, a.lo), keep(m.hi, a.hi)}; }
-inline i16 select(i16 m, i16 a, i16 b) { return {m.lo ? a.lo : b.lo, m.hi ? a.hi : b.hi}; }
 inline f16 min(f16 a, f16 b) { return {min(a.lo, b.lo), min(a.hi, b.hi)}; }
+inline i16 max(i16 a, i16 b) { return {max(a.lo, b.lo), max(a.hi, b.hi)}; }
 inline f16 abs(f16 a) { return {abs(a.lo), abs(a.hi)}; }
+inline int movemask(i16 m) { return movemask(m.lo) | movemask(m.hi) << 8; }
 inline bool any(i16 m) { return any(m.lo | m.hi); }
-inline float sum(f16 a) {
-  f8 s = a.lo + a.hi;
-  return ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
-}
+inline float sum(f16 a) { return sum(a.lo + a.hi); }
 inline i16 shift_exponent(i16 n) { return {n.lo << 23, n.hi << 23}; }
 #endif
+
+// The 4x4 pixels of a block, one per lane.
+using px = f16;
+using pxi = i16;
+constexpr int kPixels = 16;
+constexpr int kBlocks = 256 / kPixels;  // blocks of a 16x16 tile
+#if defined(__AVX512F__)
+inline px load_px(const float* p) { return *reinterpret_cast<const f16u*>(p); }
+inline void store_px(float* p, px v) { *reinterpret_cast<f16u*>(p) = v; }
+inline pxi load_pxi(const int32_t* p) { return *reinterpret_cast<const i16u*>(p); }
+inline void store_pxi(int32_t* p, pxi v) { *reinterpret_cast<i16u*>(p) = v; }
+inline pxi splat_pxi(int32_t x) { return pxi{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+#else
+inline px load_px(const float* p) { return {load8(p), load8(p + 8)}; }
+inline void store_px(float* p, px v) { store8(p, v.lo), store8(p + 8, v.hi); }
+inline pxi load_pxi(const int32_t* p) { return {load8i(p), load8i(p + 8)}; }
+inline void store_pxi(int32_t* p, pxi v) { store8i(p, v.lo), store8i(p + 8, v.hi); }
+inline pxi splat_pxi(int32_t x) { return {splat8i(x), splat8i(x)}; }
+#endif
+
 inline i8 shift_exponent(i8 n) { return n << 23; }
 
 // 2^x for |x| < 126, relative error 1.5e-7: minimax polynomial of degree 5 on [-1/2, 1/2] (Remez, relative weight)
@@ -133,12 +148,11 @@ template <class V> inline V exp2(V x) {
   const V magic = splat<V>(12582912.f);  // 1.5 * 2^23: adding it leaves round(x) in the low bits of the mantissa
   const V shifted = x + magic;
   const V f = x - (shifted - magic);
-  V p = splat<V>(1.32764719920e-03f);
-  p = p * f + splat<V>(9.67554133450e-03f);
-  p = p * f + splat<V>(5.55071327350e-02f);
-  p = p * f + splat<V>(2.40221221290e-01f);
-  p = p * f + splat<V>(6.93146967060e-01f);
-  p = p * f + splat<V>(1.0000000717e+00f);
+  const V f2 = f * f;  // Estrin's scheme: three short chains instead of one long one
+  const V low = f * splat<V>(6.93146967060e-01f) + splat<V>(1.0000000717e+00f);
+  const V mid = f * splat<V>(5.55071327350e-02f) + splat<V>(2.40221221290e-01f);
+  const V high = f * splat<V>(1.32764719920e-03f) + splat<V>(9.67554133450e-03f);
+  const V p = (high * f2 + mid) * f2 + low;
   return from_bits(bits(p) + shift_exponent(bits(shifted)));
 }
 

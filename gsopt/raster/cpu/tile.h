@@ -1,10 +1,12 @@
-// What forward and backward share inside one tile: splats in tile coordinates, and which 4x4 blocks each one touches.
+// What forward and backward share inside one tile: splats in tile coordinates, and which blocks of 4x2 or 4x4 pixels each one touches.
 // Coordinates are relative to the tile's centre, so the numbers stay small wherever the tile lies in the image.
 #pragma once
 #include "frame.h"
 #include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
+
+constexpr int kBlockRows = kPixels / 4, kStrips = kTile / kBlockRows;
 
 // exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
 struct Local {
@@ -20,15 +22,15 @@ inline TileGeometry tile_geometry(const Frame& frame, int tile) {
           static_cast<float>(tile / frame.tiles_x * kTile + kTile / 2)};
 }
 
-// Per lane the 16 bits of the blocks that the ellipse alpha >= 1/255 touches: bit 4 row + column. Over a strip of four
+// Per lane the bits of the blocks that the ellipse alpha >= 1/255 touches: bit 4 strip + column. Over a strip of
 // pixel rows the ellipse's right end lies at the strip's y nearest to that of its rightmost point; left mirrors it.
 inline i8 block_masks(f8 A, f8 B, f8 C, f8 lo, f8 dx, f8 dy) {
   const f8 zero = splat<f8>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f;
   const f8 iA = splat<f8>(1.f) / A, slope = B * iA;
   const f8 extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
   i8 mask = splat8i(0);
-  for (int row = 0; row < 4; ++row) {
-    const f8 top = splat<f8>(4.f * row - 7.5f) - dy, bottom = top + 3.f;
+  for (int strip = 0; strip < kStrips; ++strip) {
+    const f8 top = splat<f8>(static_cast<float>(kBlockRows * strip) - 7.5f) - dy, bottom = top + (kBlockRows - 1.f);
     const f8 yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
     const f8 cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
     const f8 margin = abs(slope * yr) * 2e-6f + abs(dx) * 2e-6f + 0.02f;
@@ -39,9 +41,30 @@ inline i8 block_masks(f8 A, f8 B, f8 C, f8 lo, f8 dx, f8 dy) {
     const i8 first = splat8i(4) - to_int(clamp(splat<f8>(4.f) - (left + 4.5f) * 0.25f, zero, splat<f8>(4.5f)));
     const i8 one = splat8i(1);
     const i8 columns = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one);
-    mask |= (columns & ((sr >= 0.f) | (sl >= 0.f))) << (4 * row);
+    mask |= (columns & ((sr >= 0.f) | (sl >= 0.f))) << (4 * strip);
   }
   return mask & (t > 0.f);
+}
+
+// 0, 1, 2, ...: a broadcast from memory is cheaper than moving a counter into a vector register.
+struct Counting {
+  int32_t at[kChunk];
+  constexpr Counting() : at() {
+    for (int k = 0; k < kChunk; ++k) at[k] = k + 1;
+  }
+};
+inline constexpr Counting kOneBased;
+
+// Exponent of a splat at a block's pixels, and what its gradient is made of.
+struct Exponent {
+  px u, v, e;
+};
+inline Exponent exponent(const Local& l, int j, px X, px Y) {
+  Exponent out;
+  out.u = splat<px>(l.A[j]) * X + (splat<px>(l.B[j]) * Y + splat<px>(l.u0[j]));
+  out.v = splat<px>(l.C[j]) * Y + splat<px>(l.v0[j]);
+  out.e = splat<px>(l.log2_opacity[j]) - out.v * out.v - out.u * out.u;  // v is ready first
+  return out;
 }
 
 constexpr float kNowhere = -1e30f;  // log2_opacity of the padding
@@ -74,21 +97,21 @@ inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeom
   }
 }
 
-// The pixel coordinates of a block's 16 lanes: four rows of four.
-inline void block_pixels(int block, f16& X, f16& Y) {
+// The pixel coordinates of a block's lanes: rows of four.
+inline void block_pixels(int block, px& X, px& Y) {
   alignas(64) float x[kPixels], y[kPixels];
   for (int k = 0; k < kPixels; ++k) {
     x[k] = static_cast<float>(4 * (block % 4) + k % 4) - 7.5f;
-    y[k] = static_cast<float>(4 * (block / 4) + k / 4) - 7.5f;
+    y[k] = static_cast<float>(kBlockRows * (block / 4) + k / 4) - 7.5f;
   }
-  X = load16(x), Y = load16(y);
+  X = load_px(x), Y = load_px(y);
 }
 
 // Calls visit(pixel of the image, lane) for the lanes of a block that lie inside the image.
 template <class Visit> inline void for_each_pixel(const Frame& frame, int tile, int block, Visit&& visit) {
-  const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4), y0 = tile / frame.tiles_x * kTile + 4 * (block / 4);
+  const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4), y0 = tile / frame.tiles_x * kTile + kBlockRows * (block / 4);
   const int w = frame.camera.width, h = frame.camera.height;
-  for (int y = 0; y < 4 && y0 + y < h; ++y)
+  for (int y = 0; y < kBlockRows && y0 + y < h; ++y)
     for (int x = 0; x < 4 && x0 + x < w; ++x) visit(static_cast<int64_t>(y0 + y) * w + x0 + x, 4 * y + x);
 }
 
