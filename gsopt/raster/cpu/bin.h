@@ -9,6 +9,7 @@ namespace gsopt::GSOPT_ISA {
 
 constexpr int kRadixBits = 11, kRadix = 1 << kRadixBits;
 constexpr int kSortChunk = 1 << 15;
+constexpr int kAhead = 16;  // splats are visited in depth order, that is anywhere in memory: ask for them early
 
 // Least significant digit first, 3 passes of 11 bits; chunks of the input keep their order, so ties go by index.
 inline void sort_stage(Pool& pool, Frame& frame) {
@@ -91,6 +92,7 @@ inline void count_stage(Pool& pool, Frame& frame, int chunks) {
     uint32_t* mine = counts + static_cast<int64_t>(chunk) * tiles;
     std::memset(mine, 0, sizeof(uint32_t) * tiles);
     for (int64_t i = frame.visible * chunk / chunks, end = frame.visible * (chunk + 1) / chunks; i < end; ++i) {
+      __builtin_prefetch(&records[order[i + kAhead < end ? i + kAhead : i]], 1);
       Record& r = records[order[i]];
       uint32_t n = 0;
       for_each_tile(frame, r, [&](int tile) { ++mine[tile], ++n; });
@@ -128,6 +130,7 @@ inline void fill_stage(Pool& pool, Frame& frame, int chunks) {
   parallel(pool, chunks, [&](int chunk, int) {
     uint32_t* next = counts + static_cast<int64_t>(chunk) * frame.tiles();
     for (int64_t i = frame.visible * chunk / chunks, end = frame.visible * (chunk + 1) / chunks; i < end; ++i) {
+      __builtin_prefetch(&records[order[i + kAhead < end ? i + kAhead : i]]);
       const Record& r = records[order[i]];
       uint32_t slot = r.slot;
       for_each_tile(frame, r, [&](int tile) { entries[next[tile]++] = {order[i], slot++}; });

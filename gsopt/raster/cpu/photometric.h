@@ -25,19 +25,27 @@ inline void filter_row(const float* in, float* out, int n) {
   }
 }
 
-// Across rows: eleven filtered rows, the current one in the middle.
-inline f8 filter_column(float* const rows[kTaps], int i) {
-  f8 sum = load8(rows[kRadius] + i) * kWindow[0];
-  for (int k = 1; k <= kRadius; ++k) sum += (load8(rows[kRadius - k] + i) + load8(rows[kRadius + k] + i)) * kWindow[k];
-  return sum;
-}
-
+// The last eleven filtered rows. Each row is written twice, eleven slots apart, so that any window is contiguous.
 template <int Maps> struct Ring {
-  alignas(64) float row[kTaps][Maps][kStrip + 8];
-  // Row y of map m, for any y >= -kRadius.
-  float* at(int y, int map) { return row[(y + kTaps) % kTaps][map]; }
-  void window(int y, int map, float* rows[kTaps]) {
-    for (int k = 0; k < kTaps; ++k) rows[k] = at(y - kRadius + k, map);
+  static constexpr int kStride = kStrip + 8;
+  alignas(64) float slot[2 * kTaps][Maps][kStride];
+
+  // Row y, for any y >= -kRadius, from what `write` puts into one float[kStride].
+  template <class Write> void put(int y, int map, Write&& write) {
+    float* first = slot[(y + kTaps) % kTaps][map];
+    write(first);
+    std::memcpy(slot[(y + kTaps) % kTaps + kTaps][map], first, sizeof(float) * kStride);
+  }
+  // The topmost of the eleven rows around y.
+  const float* window(int y, int map) const { return slot[(y + kTaps - kRadius) % kTaps][map]; }
+
+  // Across rows, at float i of the window that begins at `top`.
+  static f8 filter(const float* top, int i) {
+    constexpr int row = Maps * kStride;
+    const float* center = top + kRadius * row + i;
+    f8 sum = load8(center) * kWindow[0];
+    for (int k = 1; k <= kRadius; ++k) sum += (load8(center - k * row) + load8(center + k * row)) * kWindow[k];
+    return sum;
   }
 };
 
@@ -67,21 +75,23 @@ inline f8 ssim_partials(f8 mx, f8 my, f8 square, f8 product, f8& d_mean, f8& d_s
   return ssim;
 }
 
-inline double sum_first(f8 v, int n) {
-  double s = 0;
-  for (int l = 0; l < n; ++l) s += v[l];
-  return s;
+using d8 = double __attribute__((vector_size(64)));
+
+// Adds the first n lanes to a running sum in double.
+inline void accumulate(d8& sum, f8 v, int n) {
+  if (n < 8)
+    for (int l = n; l < 8; ++l) v[l] = 0.f;
+  sum += __builtin_convertvector(v, d8);
 }
+inline double total(d8 v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])); }
 
 // Pass 1: SSIM and its partials (three maps of the image's size), for the rows of a band and the floats of a strip.
 inline void ssim_band(const PhotometricArguments& a, const Band& band, float* const maps[3], double* row_ssim) {
   Ring<4> ring;
   Piece x, y, square, product;
   for (int row = band.y0 - kRadius; row < band.y1 + kRadius; ++row) {
-    float* out[4];
-    for (int m = 0; m < 4; ++m) out[m] = ring.at(row, m);
     if (row < 0 || row >= band.height) {
-      for (int m = 0; m < 4; ++m) std::memset(out[m], 0, sizeof(float) * kStrip);
+      for (int m = 0; m < 4; ++m) ring.put(row, m, [](float* out) { std::memset(out, 0, sizeof(float) * kStrip); });
     } else {
       x.load(a.rendered + static_cast<int64_t>(row) * band.width, band.width, band.x0, band.n);
       y.load(a.target + static_cast<int64_t>(row) * band.width, band.width, band.x0, band.n);
@@ -89,27 +99,26 @@ inline void ssim_band(const PhotometricArguments& a, const Band& band, float* co
         const f8 vx = load8(x.at() + i), vy = load8(y.at() + i);
         store8(square.at() + i, vx * vx + vy * vy), store8(product.at() + i, vx * vy);
       }
-      filter_row(x.at(), out[0], band.n), filter_row(y.at(), out[1], band.n);
-      filter_row(square.at(), out[2], band.n), filter_row(product.at(), out[3], band.n);
+      Piece* const pieces[4] = {&x, &y, &square, &product};
+      for (int m = 0; m < 4; ++m) ring.put(row, m, [&](float* out) { filter_row(pieces[m]->at(), out, band.n); });
     }
     const int center = row - kRadius;
     if (center < band.y0) continue;
-    float* rows[4][kTaps];
-    for (int m = 0; m < 4; ++m) ring.window(center, m, rows[m]);
+    const float* top[4];
+    for (int m = 0; m < 4; ++m) top[m] = ring.window(center, m);
     const int64_t at = static_cast<int64_t>(center) * band.width + band.x0;
-    double total = 0;
+    d8 sum = {};
     for (int i = 0; i < band.n; i += 8) {
       f8 d[3];
-      const f8 ssim = ssim_partials(filter_column(rows[0], i), filter_column(rows[1], i), filter_column(rows[2], i),
-                                    filter_column(rows[3], i), d[0], d[1], d[2]);
+      const f8 ssim = ssim_partials(ring.filter(top[0], i), ring.filter(top[1], i), ring.filter(top[2], i), ring.filter(top[3], i), d[0], d[1], d[2]);
       const int live = band.n - i < 8 ? band.n - i : 8;
-      total += sum_first(ssim, live);
+      accumulate(sum, ssim, live);
       for (int m = 0; m < 3; ++m) {
         if (live == 8) store8(maps[m] + at + i, d[m]);
         else for (int l = 0; l < live; ++l) maps[m][at + i + l] = d[m][l];
       }
     }
-    row_ssim[center] = total;
+    row_ssim[center] = total(sum);
   }
 }
 
@@ -123,32 +132,32 @@ inline void gradient_band(const PhotometricArguments& a, const Band& band, float
   for (int row = band.y0 - kRadius; row < band.y1 + kRadius; ++row) {
     for (int m = 0; m < 3; ++m) {
       if (row < 0 || row >= band.height) {
-        std::memset(ring.at(row, m), 0, sizeof(float) * kStrip);
+        ring.put(row, m, [](float* out) { std::memset(out, 0, sizeof(float) * kStrip); });
       } else {
         piece.load(maps[m] + static_cast<int64_t>(row) * band.width, band.width, band.x0, band.n);
-        filter_row(piece.at(), ring.at(row, m), band.n);
+        ring.put(row, m, [&](float* out) { filter_row(piece.at(), out, band.n); });
       }
     }
     const int center = row - kRadius;
     if (center < band.y0) continue;
-    float* rows[3][kTaps];
-    for (int m = 0; m < 3; ++m) ring.window(center, m, rows[m]);
+    const float* top[3];
+    for (int m = 0; m < 3; ++m) top[m] = ring.window(center, m);
     const int64_t at = static_cast<int64_t>(center) * band.width + band.x0;
-    double total = 0;
+    d8 sum = {};
     for (int i = 0; i < band.n; i += 8) {
       const int live = band.n - i < 8 ? band.n - i : 8;
       f8 x = zero, y = zero;
       if (live == 8) x = load8(a.rendered + at + i), y = load8(a.target + at + i);
       else for (int l = 0; l < live; ++l) x[l] = a.rendered[at + i + l], y[l] = a.target[at + i + l];
       const f8 difference = x - y;
-      total += sum_first(abs(difference), live);
+      accumulate(sum, abs(difference), live);
       const f8 sign = select(difference > 0.f, w_l1, select(difference < 0.f, zero - w_l1, zero));
-      const f8 g = filter_column(rows[0], i) + x * 2.f * filter_column(rows[1], i) + y * filter_column(rows[2], i);
+      const f8 g = ring.filter(top[0], i) + x * 2.f * ring.filter(top[1], i) + y * ring.filter(top[2], i);
       const f8 v = sign + w_ssim * g;
       if (live == 8) store8(a.v_rendered + at + i, v);
       else for (int l = 0; l < live; ++l) a.v_rendered[at + i + l] = v[l];
     }
-    row_l1[center] = total;
+    row_l1[center] = total(sum);
   }
 }
 
