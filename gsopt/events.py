@@ -7,6 +7,7 @@ to finish its step, save and exit. A reader tails by byte offset up to the last 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -30,7 +31,8 @@ def write_atomic(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise InputError(
             f"Cannot write {path}: {error.strerror or error}. Free some space or choose another folder."
         ) from error

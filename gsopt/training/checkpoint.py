@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -43,7 +44,8 @@ def save_checkpoint(folder: Path, step: int, tensors: dict[str, Tensor], meta: d
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, SafetensorError) as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise InputError(f"Cannot write the checkpoint {path}: {error}. Free some space, then use --resume.") from error
     for old in saved(folder)[KEEP:]:
         old.unlink(missing_ok=True)

@@ -13,6 +13,8 @@ from torch import Tensor
 MOST_REFERENCES = 2048
 FEWEST = 64
 """Below this many Gaussians the statistics mean nothing and none is called a floater."""
+LEAST_SPREAD = 0.01
+"""Smallest standard deviation, as a share of the mean: where all are alike, rounding alone makes no floater."""
 CHUNK = 1024
 
 
@@ -21,7 +23,8 @@ def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:
     if len(means) < FEWEST:
         return torch.zeros(len(means), dtype=torch.bool)
     distances = neighbor_distances(means)
-    return distances > distances.mean() + sigmas * distances.std()
+    mean = distances.mean()
+    return distances > mean + sigmas * torch.maximum(distances.std(), LEAST_SPREAD * mean)
 
 
 def neighbor_distances(means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:

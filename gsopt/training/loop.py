@@ -12,12 +12,12 @@ from pathlib import Path
 
 import torch
 
-from gsopt import init as beginning
 from gsopt.config import TrainConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
 from gsopt.formats import save_splats
 from gsopt.gaussians import Gaussians
+from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.training import schedule
@@ -134,7 +134,7 @@ def _start(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDi
     checkpoint = load_newest(directory.checkpoints, directory.warn)
     if checkpoint is None:
         highest = schedule.max_sh_degree(config, len(names))
-        gaussians, init = beginning.first_gaussians(scene, config.init, highest, config.seed)
+        gaussians, init = first_gaussians(scene, config.init, highest, config.seed)
         if len(gaussians) == 0:
             raise InputError(f"`{init}` made no Gaussians. Choose another --init.")
         directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin))

@@ -76,13 +76,3 @@ def tiny_config(dataset: Path, **changes: object) -> TrainConfig:
         **changes,
     }
     return TrainConfig(**settings)  # type: ignore[arg-type]
-
-
-import gsopt.init  # noqa: E402
-
-if not hasattr(gsopt.init, "first_gaussians"):  # TEMPORARY until gsopt.init lands
-
-    def _first(scene, config, sh_degree, seed):
-        return cloud(config.count, seed + 1, sh_degree=sh_degree), "random, stand-in"
-
-    gsopt.init.first_gaussians = _first
