@@ -47,7 +47,9 @@ def loss_of(gaussians, dataset: Path) -> float:
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_training_brings_the_splats_closer_to_the_views(strategy: str, dataset: Path, tmp_path: Path) -> None:
     density = DensityConfig(strategy=strategy, refine_start=10, refine_every=20, max_gaussians=90)  # type: ignore[arg-type]
-    config = tiny_config(dataset, density=density, iterations=80, sparse=SparseConfig(below_views=0))
+    config = tiny_config(
+        dataset, density=density, iterations=80, sparse=SparseConfig(below_views=0), backend="reference"
+    )
     result = train(config, tmp_path / "run")
     scene = load_scene(config.data)
     before, _ = first_gaussians(scene, config.init, 3, config.seed)

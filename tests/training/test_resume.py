@@ -43,11 +43,12 @@ def configs(dataset: Path) -> dict[str, TrainConfig]:
         "mcmc": replace(base, density=mcmc, sparse=SparseConfig(below_views=0)),
         "few views": replace(base, sparse=SparseConfig(floater_every=7)),
         "random background": replace(base, data=DataConfig(path=str(dataset), background="random")),
+        "reference backend": replace(base, backend="reference"),
         "coarse to fine": replace(base, schedule=ScheduleConfig(coarse_until=(12,), stop_when_flat=True)),
     }
 
 
-NAMES = ("adc", "mcmc", "few views", "random background", "coarse to fine")
+NAMES = ("adc", "mcmc", "few views", "random background", "reference backend", "coarse to fine")
 
 
 @pytest.fixture(scope="module")

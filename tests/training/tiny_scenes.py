@@ -1,4 +1,4 @@
-"""A scene small enough for the reference rasteriser: a cloud of splats, drawn into a NeRF-synthetic folder."""
+"""A scene small enough for either rasteriser: a cloud of splats, drawn into a NeRF-synthetic folder."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def tiny_config(dataset: Path, **changes: object) -> TrainConfig:
         "init": InitConfig(method="random", count=60),
         "density": DensityConfig(refine_start=4, refine_every=5, refine_stop=25, grow_grad2d=5e-5, max_gaussians=90),
         "iterations": 30,
-        "backend": "reference",
+        "backend": "cpu",
         "checkpoint_every": 10,
         "preview_every": 15,
         **changes,
