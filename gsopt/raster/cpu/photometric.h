@@ -1,9 +1,9 @@
 // (1 - lambda) L1 + lambda (1 - SSIM) and its gradient, fused (docs/math.md, section "SSIM").
 //
 // SSIM needs five filtered images; only the sum of the two variances enters, so four do: x, y, x² + y², x y. The
-// 11-tap window is separable and runs over rows of interleaved RGB (neighbours are three floats apart), in strips
-// narrow enough that the eleven rows under the window stay in cache. Sums go row by row in double: the same bits for
-// any number of threads.
+// 11-tap window is separable: first down the columns, two rows of output at a time, so that each input is loaded once
+// for both and the squares and products need no image of their own; then along the rows of interleaved RGB, where
+// neighbors are three floats apart. Sums go row by row in double: the same bits for any number of threads.
 #pragma once
 #include "frame.h"
 #include "parallel.h"
@@ -11,58 +11,71 @@
 
 namespace gsopt::GSOPT_ISA {
 
-constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kStrip = 384, kHalo = 3 * kRadius;
+constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kStrip = 480, kHalo = 3 * kRadius;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 // exp(-k² / (2 1.5²)), normalised over k = -5..5; index = |k|.
 constexpr float kWindow[kRadius + 1] = {0.26601172f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
 
-// Along a row: in points at the strip's first float of a row that is readable kHalo floats beyond either end.
-inline void filter_row(const float* in, float* out, int n) {
-  for (int i = 0; i < n; i += 8) {
-    f8 sum = load8(in + i) * kWindow[0];
-    for (int k = 1; k <= kRadius; ++k) sum += (load8(in + i - 3 * k) + load8(in + i + 3 * k)) * kWindow[k];
-    store8(out + i, sum);
+// Weights of the twelve input rows y - 5 ... y + 6 in the output rows y and y + 1.
+struct PairWindow {
+  float at[kTaps + 1][2];
+  constexpr PairWindow() : at() {
+    for (int k = 0; k <= kTaps; ++k) {
+      at[k][0] = k == kTaps ? 0.f : kWindow[k < kRadius ? kRadius - k : k - kRadius];
+      at[k][1] = k == 0 ? 0.f : kWindow[k - 1 < kRadius ? kRadius - k + 1 : k - 1 - kRadius];
+    }
   }
-}
+};
+inline constexpr PairWindow kPairWindow;
 
-// The last eleven filtered rows. Each row is written twice, eleven slots apart, so that any window is contiguous.
-template <int Maps> struct Ring {
-  static constexpr int kStride = kStrip + 8;
-  alignas(64) float slot[2 * kTaps][Maps][kStride];
+// A rectangle of the image: rows [y0, y1), floats [x0, x0 + n) of rows of `width` floats.
+struct Band {
+  int y0, y1, x0, n, width, height;
+};
 
-  // Row y, for any y >= -kRadius, from what `write` puts into one float[kStride].
-  template <class Write> void put(int y, int map, Write&& write) {
-    float* first = slot[(y + kTaps) % kTaps][map];
-    write(first);
-    std::memcpy(slot[(y + kTaps) % kTaps + kTaps][map], first, sizeof(float) * kStride);
+// Two rows of `Maps` images filtered down the columns, for a strip and kHalo floats on either side; zeros outside.
+template <int Maps> struct Columns {
+  static constexpr int kPad = kHalo + 1, kStride = kStrip + 2 * kPad + 8;
+  alignas(64) float data[2][Maps][kStride];
+
+  // `load(row, i, values)` puts the inputs of the maps at float i of a row into values[Maps].
+  template <class Load> void fill(const Band& b, int y, Load&& load) {
+    std::memset(data, 0, sizeof(data));
+    const int first = b.x0 - kHalo < 0 ? 0 : b.x0 - kHalo, end = b.x0 + b.n + kHalo > b.width ? b.width : b.x0 + b.n + kHalo;
+    const int k0 = y < kRadius ? kRadius - y : 0, k1 = y + kRadius + 1 < b.height ? kTaps + 1 : b.height - y + kRadius;
+    for (int i = first; i < end; i += 8) {
+      const int at = i + 8 <= end ? i : (end - 8 > first ? end - 8 : first);  // the last vector overlaps its neighbor
+      f8 sum[2][Maps] = {};
+      for (int k = k0; k < k1; ++k) {
+        f8 value[Maps];
+        load(y - kRadius + k, at, end - at, value);
+        for (int m = 0; m < Maps; ++m) sum[0][m] += value[m] * kPairWindow.at[k][0], sum[1][m] += value[m] * kPairWindow.at[k][1];
+      }
+      for (int r = 0; r < 2; ++r)
+        for (int m = 0; m < Maps; ++m) store8(&data[r][m][at - b.x0 + kPad], sum[r][m]);
+    }
   }
-  // The topmost of the eleven rows around y.
-  const float* window(int y, int map) const { return slot[(y + kTaps - kRadius) % kTaps][map]; }
 
-  // Across rows, at float i of the window that begins at `top`.
-  static f8 filter(const float* top, int i) {
-    constexpr int row = Maps * kStride;
-    const float* center = top + kRadius * row + i;
+  // Along the row, at float i of the strip.
+  f8 filter(int row, int map, int i) const {
+    const float* center = &data[row][map][kPad + i];
     f8 sum = load8(center) * kWindow[0];
-    for (int k = 1; k <= kRadius; ++k) sum += (load8(center - k * row) + load8(center + k * row)) * kWindow[k];
+    for (int k = 1; k <= kRadius; ++k) sum += (load8(center - 3 * k) + load8(center + 3 * k)) * kWindow[k];
     return sum;
   }
 };
 
-// A piece of a row with kHalo floats on both sides, zeros outside the image.
-struct Piece {
-  alignas(64) float data[kHalo + 1 + kStrip + kHalo + 16];
-  float* at() { return data + kHalo + 1; }
-  void load(const float* row, int width, int x0, int n) {
-    const int first = x0 - kHalo < 0 ? 0 : x0 - kHalo, end = x0 + n + kHalo > width ? width : x0 + n + kHalo;
-    std::memset(data, 0, sizeof(data));
-    std::memcpy(at() + (first - x0), row + first, sizeof(float) * (end - first));
-  }
-};
-
-struct Band {
-  int y0, y1, x0, n, width, height;  // rows; floats of a row
-};
+// Eight floats, or the first n of them and zeros.
+inline f8 load_first(const float* p, int n) {
+  if (n >= 8) return load8(p);
+  f8 v = splat<f8>(0.f);
+  for (int l = 0; l < n; ++l) v[l] = p[l];
+  return v;
+}
+inline void store_first(float* p, f8 v, int n) {
+  if (n >= 8) return store8(p, v);
+  for (int l = 0; l < n; ++l) p[l] = v[l];
+}
 
 // The partial derivatives of SSIM at one pixel-channel with respect to E[x], E[x² + y²], E[x y], and SSIM itself.
 inline f8 ssim_partials(f8 mx, f8 my, f8 square, f8 product, f8& d_mean, f8& d_square, f8& d_product) {
@@ -75,103 +88,81 @@ inline f8 ssim_partials(f8 mx, f8 my, f8 square, f8 product, f8& d_mean, f8& d_s
   return ssim;
 }
 
-using d8 = double __attribute__((vector_size(64)));
-
-// Adds the first n lanes to a running sum in double.
-inline void accumulate(d8& sum, f8 v, int n) {
-  if (n < 8)
+// A running sum in double.
+struct Sum {
+  using d4 = double __attribute__((vector_size(32)));
+  d4 low = {}, high = {};
+  // Adds the first n of eight floats.
+  void add(f8 v, int n) {
     for (int l = n; l < 8; ++l) v[l] = 0.f;
-  sum += __builtin_convertvector(v, d8);
-}
-inline double total(d8 v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])); }
+    low += __builtin_convertvector(__builtin_shufflevector(v, v, 0, 1, 2, 3), d4);
+    high += __builtin_convertvector(__builtin_shufflevector(v, v, 4, 5, 6, 7), d4);
+  }
+  double total() const { return ((low[0] + low[1]) + (low[2] + low[3])) + ((high[0] + high[1]) + (high[2] + high[3])); }
+};
 
-// Pass 1: SSIM and its partials (three maps of the image's size), for the rows of a band and the floats of a strip.
-inline void ssim_band(const PhotometricArguments& a, const Band& band, float* const maps[3], double* row_ssim) {
-  Ring<4> ring;
-  Piece x, y, square, product;
-  for (int row = band.y0 - kRadius; row < band.y1 + kRadius; ++row) {
-    if (row < 0 || row >= band.height) {
-      for (int m = 0; m < 4; ++m) ring.put(row, m, [](float* out) { std::memset(out, 0, sizeof(float) * kStrip); });
-    } else {
-      x.load(a.rendered + static_cast<int64_t>(row) * band.width, band.width, band.x0, band.n);
-      y.load(a.target + static_cast<int64_t>(row) * band.width, band.width, band.x0, band.n);
-      for (int i = -16; i < band.n + kHalo; i += 8) {
-        const f8 vx = load8(x.at() + i), vy = load8(y.at() + i);
-        store8(square.at() + i, vx * vx + vy * vy), store8(product.at() + i, vx * vy);
+// Pass 1: SSIM and its partials (three maps of the image's size), over a band.
+inline void ssim_band(const PhotometricArguments& a, const Band& b, float* const maps[3], double* row_ssim) {
+  Columns<4> columns;
+  for (int y = b.y0; y < b.y1; y += 2) {
+    columns.fill(b, y, [&](int row, int i, int n, f8* value) {
+      const int64_t at = static_cast<int64_t>(row) * b.width + i;
+      const f8 vx = load_first(a.rendered + at, n), vy = load_first(a.target + at, n);
+      value[0] = vx, value[1] = vy, value[2] = vx * vx + vy * vy, value[3] = vx * vy;
+    });
+    for (int r = 0; r < 2 && y + r < b.y1; ++r) {
+      const int64_t at = static_cast<int64_t>(y + r) * b.width + b.x0;
+      float *mean = maps[0] + at, *square = maps[1] + at, *product = maps[2] + at;
+      Sum sum;
+      for (int i = 0; i < b.n; i += 8) {
+        f8 d[3];
+        const f8 ssim = ssim_partials(columns.filter(r, 0, i), columns.filter(r, 1, i), columns.filter(r, 2, i), columns.filter(r, 3, i),
+                                      d[0], d[1], d[2]);
+        sum.add(ssim, b.n - i);
+        store_first(mean + i, d[0], b.n - i), store_first(square + i, d[1], b.n - i), store_first(product + i, d[2], b.n - i);
       }
-      Piece* const pieces[4] = {&x, &y, &square, &product};
-      for (int m = 0; m < 4; ++m) ring.put(row, m, [&](float* out) { filter_row(pieces[m]->at(), out, band.n); });
+      row_ssim[y + r] = sum.total();
     }
-    const int center = row - kRadius;
-    if (center < band.y0) continue;
-    const float* top[4];
-    for (int m = 0; m < 4; ++m) top[m] = ring.window(center, m);
-    const int64_t at = static_cast<int64_t>(center) * band.width + band.x0;
-    d8 sum = {};
-    for (int i = 0; i < band.n; i += 8) {
-      f8 d[3];
-      const f8 ssim = ssim_partials(ring.filter(top[0], i), ring.filter(top[1], i), ring.filter(top[2], i), ring.filter(top[3], i), d[0], d[1], d[2]);
-      const int live = band.n - i < 8 ? band.n - i : 8;
-      accumulate(sum, ssim, live);
-      for (int m = 0; m < 3; ++m) {
-        if (live == 8) store8(maps[m] + at + i, d[m]);
-        else for (int l = 0; l < live; ++l) maps[m][at + i + l] = d[m][l];
-      }
-    }
-    row_ssim[center] = total(sum);
   }
 }
 
 // Pass 2: the window is symmetric, so its transpose is itself: v = F(d_mean) + 2 x F(d_square) + y F(d_product).
-inline void gradient_band(const PhotometricArguments& a, const Band& band, float* const maps[3], double* row_l1) {
-  Ring<3> ring;
-  Piece piece;
-  const double count = static_cast<double>(band.width) * band.height;
+inline void gradient_band(const PhotometricArguments& a, const Band& b, float* const maps[3], double* row_l1) {
+  Columns<3> columns;
+  const double count = static_cast<double>(b.width) * b.height;
   const f8 w_l1 = splat<f8>(static_cast<float>((1.0 - a.lambda_dssim) / count)), w_ssim = splat<f8>(static_cast<float>(-a.lambda_dssim / count));
   const f8 zero = splat<f8>(0.f);
-  for (int row = band.y0 - kRadius; row < band.y1 + kRadius; ++row) {
-    for (int m = 0; m < 3; ++m) {
-      if (row < 0 || row >= band.height) {
-        ring.put(row, m, [](float* out) { std::memset(out, 0, sizeof(float) * kStrip); });
-      } else {
-        piece.load(maps[m] + static_cast<int64_t>(row) * band.width, band.width, band.x0, band.n);
-        ring.put(row, m, [&](float* out) { filter_row(piece.at(), out, band.n); });
+  for (int y = b.y0; y < b.y1; y += 2) {
+    columns.fill(b, y, [&](int row, int i, int n, f8* value) {
+      const int64_t at = static_cast<int64_t>(row) * b.width + i;
+      for (int m = 0; m < 3; ++m) value[m] = load_first(maps[m] + at, n);
+    });
+    for (int r = 0; r < 2 && y + r < b.y1; ++r) {
+      const int64_t at = static_cast<int64_t>(y + r) * b.width + b.x0;
+      Sum sum;
+      for (int i = 0; i < b.n; i += 8) {
+        const f8 x = load_first(a.rendered + at + i, b.n - i), target = load_first(a.target + at + i, b.n - i), difference = x - target;
+        sum.add(abs(difference), b.n - i);
+        const f8 sign = select(difference > 0.f, w_l1, select(difference < 0.f, zero - w_l1, zero));
+        const f8 g = columns.filter(r, 0, i) + x * 2.f * columns.filter(r, 1, i) + target * columns.filter(r, 2, i);
+        store_first(a.v_rendered + at + i, sign + w_ssim * g, b.n - i);
       }
+      row_l1[y + r] = sum.total();
     }
-    const int center = row - kRadius;
-    if (center < band.y0) continue;
-    const float* top[3];
-    for (int m = 0; m < 3; ++m) top[m] = ring.window(center, m);
-    const int64_t at = static_cast<int64_t>(center) * band.width + band.x0;
-    d8 sum = {};
-    for (int i = 0; i < band.n; i += 8) {
-      const int live = band.n - i < 8 ? band.n - i : 8;
-      f8 x = zero, y = zero;
-      if (live == 8) x = load8(a.rendered + at + i), y = load8(a.target + at + i);
-      else for (int l = 0; l < live; ++l) x[l] = a.rendered[at + i + l], y[l] = a.target[at + i + l];
-      const f8 difference = x - y;
-      accumulate(sum, abs(difference), live);
-      const f8 sign = select(difference > 0.f, w_l1, select(difference < 0.f, zero - w_l1, zero));
-      const f8 g = ring.filter(top[0], i) + x * 2.f * ring.filter(top[1], i) + y * ring.filter(top[2], i);
-      const f8 v = sign + w_ssim * g;
-      if (live == 8) store8(a.v_rendered + at + i, v);
-      else for (int l = 0; l < live; ++l) a.v_rendered[at + i + l] = v[l];
-    }
-    row_l1[center] = total(sum);
   }
 }
 
 inline void photometric_stage(Pool& pool, PhotometricArguments& a) {
   const int width = 3 * a.width, strips = divide_up(width, kStrip), bands = pool.threads() == 1 ? 1 : 2 * pool.threads();
+  const int rows = (a.height + 2 * bands - 1) / (2 * bands) * 2;  // even, so that no pair of rows is split
   const int64_t size = static_cast<int64_t>(width) * a.height, padded = (size + 15) / 16 * 16;
   a.scratch->reserve(sizeof(float) * 3 * padded + sizeof(double) * 2 * strips * a.height);
   float* maps[3];
   for (int m = 0; m < 3; ++m) maps[m] = a.scratch->as<float>() + m * padded;
   double* sums = reinterpret_cast<double*>(a.scratch->as<float>() + 3 * padded);
   const auto band = [&](int item) -> Band {
-    const int strip = item % strips, b = item / strips, x0 = strip * kStrip;
-    return {static_cast<int>(static_cast<int64_t>(a.height) * b / bands), static_cast<int>(static_cast<int64_t>(a.height) * (b + 1) / bands),
-            x0, width - x0 < kStrip ? width - x0 : kStrip, width, a.height};
+    const int strip = item % strips, x0 = strip * kStrip, y0 = item / strips * rows;
+    return {y0 < a.height ? y0 : a.height, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < kStrip ? width - x0 : kStrip, width, a.height};
   };
   double *ssim = sums, *l1 = sums + static_cast<int64_t>(strips) * a.height;
   parallel(pool, bands * strips, [&](int item, int) { ssim_band(a, band(item), maps, ssim + static_cast<int64_t>(item % strips) * a.height); });
