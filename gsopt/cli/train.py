@@ -113,7 +113,7 @@ def main(argv: Sequence[str]) -> int:
 def judge(config: settings.TrainConfig, result: TrainResult, console: RunConsole) -> None:
     """Evaluate, write the report, and end the run with the event `done` (`error` when one of these fails)."""
     from gsopt.cli.console import clock
-    from gsopt.evaluate import evaluate, read_metrics
+    from gsopt.evaluation import evaluate, read_metrics
     from gsopt.report import write_report
     from gsopt.training.run_directory import opened
 
