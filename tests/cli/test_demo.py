@@ -27,6 +27,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
     module = ModuleType("gsopt.cli.train")
     module.main = train  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "gsopt.cli.train", module)
+    monkeypatch.setattr(cli, "train", module, raising=False)  # where the real one was imported before
     scene = tmp_path / "scene"
     scene.mkdir()
     (scene / "transforms_train.json").write_text("{}")
