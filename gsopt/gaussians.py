@@ -12,8 +12,8 @@ from torch import Tensor
 from gsopt import check
 from gsopt.errors import InputError
 
-# Below this norm the square underflows in float32 and the rotation is lost.
-SMALLEST_QUAT = 1e-18
+# Below this its reciprocal nears the end of float32's range, and the direction is lost.
+SMALLEST_QUAT = 1e-30
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -93,7 +93,7 @@ class Gaussians:
         for name, tensor in self.items():
             check.shape(name, tensor, expected[name])
             check.finite(name, tensor)
-        zero = torch.nonzero(torch.linalg.vector_norm(self.quats, dim=-1) < SMALLEST_QUAT)
+        zero = torch.nonzero(self.quats.abs().amax(dim=-1) < SMALLEST_QUAT)
         if len(zero):
             row = int(zero[0, 0])
             raise InputError(

@@ -9,11 +9,14 @@ from torch import Tensor
 
 def normalize(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 4"]:
     """Unit quaternions. A zero quaternion gives NaN: refuse it at the border (`Gaussians.validate`)."""
-    return quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
+    # The largest component is divided out first, so that no square leaves the range of the dtype. It is held constant
+    # for autograd: the result does not depend on it.
+    scaled = quats / quats.detach().abs().amax(dim=-1, keepdim=True)
+    return scaled / torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
 
 
 def rotation_matrices(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
-    """R(q / |q|), so that R(q) v = q v q*/|q|² (docs/math.md, 3)."""
+    """R(q / |q|), so that R(q) v = q v q*/|q|² (docs/math.md, eq. 3)."""
     w, x, y, z = normalize(quats).unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z),

@@ -1,0 +1,225 @@
+"""Every backend draws the image, and the gradient, of the float64 reference."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, assume, given, settings
+from raster_scenes import Case, cases, make_case, undecided_gaussians, undecided_pixels, weights_like, with_parameter
+from tolerances import (
+    ADAM,
+    DECISION,
+    DEPTH,
+    GRADIENT,
+    GRADIENT_FLOOR,
+    IMAGE,
+    LOSS,
+    NEEDLE,
+    SSIM_GRADIENT,
+    UNDECIDED_SHARE,
+)
+from torch import Tensor
+
+from gsopt.errors import MissingDependency
+from gsopt.gaussians import PARAMETERS
+from gsopt.raster.api import make_backend
+from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
+from gsopt.raster.reference import ReferenceBackend, extents, project
+
+ORACLE = ReferenceBackend()
+drawn = settings(
+    max_examples=20, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def built(name: str, threads: int = 2) -> Backend:
+    try:
+        return make_backend(name, threads)
+    except MissingDependency as error:
+        pytest.skip(str(error))
+
+
+# The reference in float32 is held to the same tolerances: they ask of no kernel what plain float32 code cannot do.
+@pytest.fixture(params=["reference", "cpu"])
+def backend(request: pytest.FixtureRequest) -> Backend:
+    return built(request.param)
+
+
+def single(case: Case) -> Case:
+    return replace(case, gaussians=case.gaussians.to(torch.float32))
+
+
+def draw(backend: Backend, case: Case) -> Frame:
+    return backend.forward(case.gaussians, case.camera, case.settings, case.background, depth=True)
+
+
+def check_images(got: Frame, expected: Frame, decided: Tensor) -> None:
+    assert got.depths is not None
+    assert expected.depths is not None
+    assert got.colors.dtype == torch.float32
+    errors = torch.cat([got.colors - expected.colors, (got.alphas - expected.alphas)[..., None]], dim=-1)
+    assert float(errors[decided].abs().amax()) <= IMAGE
+    depth_errors = (got.depths - expected.depths)[decided].abs()
+    assert float(depth_errors.amax()) <= DEPTH * max(1.0, float(expected.depths.amax()))
+
+
+def check_gradients(got: Gradients, expected: Gradients, floor: float) -> None:
+    assert expected.means2d_abs is not None
+    permitted = floor * float(torch.linalg.vector_norm(expected.means2d_abs))
+    for field in fields(Gradients):
+        mine, truth = getattr(got, field.name), getattr(expected, field.name)
+        assert mine.shape == truth.shape, field.name
+        error = float(torch.linalg.vector_norm(mine - truth))
+        assert error <= GRADIENT * float(torch.linalg.vector_norm(truth)) + permitted, field.name
+
+
+def both_gradients(backend: Backend, case: Case) -> tuple[Gradients, Gradients]:
+    """The backend's and the oracle's, after their images were found to agree; undecided pixels have no weight."""
+    decided = ~undecided_pixels(case, DECISION)
+    expected, got = draw(ORACLE, case), draw(backend, single(case))
+    check_images(got, expected, decided)
+    v_colors, v_alphas, v_depths = (v * decided.view(*decided.shape, *[1] * (v.dim() - 2)) for v in weights_like(case))
+    truth = ORACLE.backward(expected, v_colors, v_alphas, v_depths, absgrad=True)
+    mine = backend.backward(got, v_colors.float(), v_alphas.float(), v_depths.float(), absgrad=True)
+    return mine, truth
+
+
+@drawn
+@given(case=cases())
+def test_random_scenes(backend: Backend, case: Case) -> None:
+    assume(not undecided_gaussians(case, DECISION))
+    undecided = undecided_pixels(case, DECISION)
+    assume(float(undecided.double().mean()) <= UNDECIDED_SHARE)
+    check_gradients(*both_gradients(backend, case), floor=GRADIENT_FLOOR)
+
+
+@pytest.mark.parametrize(
+    "setting", [RasterSettings(), RasterSettings(antialiased=True), RasterSettings(sh_degree=0, eps2d=1.0)]
+)
+def test_many_layers_over_several_tiles(backend: Backend, setting: RasterSettings) -> None:
+    case = make_case(5, count=300, width=67, height=35, settings=setting)
+    assert float(undecided_pixels(case, DECISION).double().mean()) <= UNDECIDED_SHARE
+    check_gradients(*both_gradients(backend, case), floor=0)
+
+
+def test_needles() -> None:
+    # Not for the float32 reference: its determinant is a difference of large products, good enough in float64 only.
+    backend = built("cpu")
+    case = make_case(6, count=24, width=48, height=32)
+    shape = torch.tensor([0.0, -4.0, -4.0], dtype=torch.float64)
+    case = with_parameter(case, "log_scales", shape + 0.1 * case.gaussians.log_scales)
+    axes = torch.linalg.eigvalsh(project(case.gaussians, case.camera, case.settings).cov2d)
+    needles = (axes[:, 1] / axes[:, 0]).sqrt() > 10
+    mine, truth = both_gradients(backend, case)
+    assert int((needles & (truth.log_scales != 0).any(dim=1)).sum()) >= 5
+    for name in ("means", "quats", "log_scales"):
+        got, expected = getattr(mine, name)[needles], getattr(truth, name)[needles]
+        error = torch.linalg.vector_norm(got - expected, dim=1)
+        assert bool((error <= NEEDLE * torch.linalg.vector_norm(expected, dim=1)).all()), name
+
+
+@drawn
+@given(case=cases())
+def test_radii_are_the_same_where_rounding_up_cannot_tip(backend: Backend, case: Case) -> None:
+    assume(not undecided_gaussians(case, DECISION))
+    projection = project(case.gaussians, case.camera, case.settings)
+    reach = extents(projection)
+    size = reach.new_tensor([case.camera.width, case.camera.height])
+    to_rim = torch.minimum((projection.means2d + reach).abs(), (projection.means2d - reach - size).abs())
+    tips = ((reach - reach.round()).abs() < DECISION * reach) | (to_rim < DECISION * size)
+    decided = ~tips.any(dim=1)
+    got, expected = draw(backend, single(case)), draw(ORACLE, case)
+    assert got.radii.dtype == torch.int32
+    assert torch.equal(got.radii[decided], expected.radii[decided])
+
+
+def test_without_background_depth_and_extra_gradients(backend: Backend) -> None:
+    case = make_case(8)
+    frame = backend.forward(case.gaussians.to(torch.float32), case.camera, case.settings)
+    expected = ORACLE.forward(case.gaussians, case.camera, case.settings)
+    assert frame.depths is None
+    assert float((frame.colors - expected.colors).abs().max()) <= IMAGE
+    v_colors = weights_like(case)[0]
+    got = backend.backward(frame, v_colors.float())
+    truth = ORACLE.backward(expected, v_colors)
+    assert got.means2d_abs is None
+    for name in (*PARAMETERS, "means2d"):
+        mine, true = getattr(got, name), getattr(truth, name)
+        assert float(torch.linalg.vector_norm(mine - true)) <= GRADIENT * float(torch.linalg.vector_norm(true)), name
+
+
+def test_no_gaussians_and_none_in_view(backend: Backend) -> None:
+    case = make_case(8, count=4)
+    behind = replace(case.gaussians, means=case.gaussians.means + 2 * case.camera.centers)
+    for gaussians in (case.gaussians.select(torch.arange(0)), behind):
+        frame = draw(backend, single(replace(case, gaussians=gaussians)))
+        expected = case.background.float().expand_as(frame.colors)
+        torch.testing.assert_close(frame.colors, expected, atol=0, rtol=0)
+        assert float(frame.alphas.abs().max()) == 0
+        assert int(frame.radii.sum()) == 0
+        gradients = backend.backward(frame, torch.ones_like(frame.colors), absgrad=True)
+        for field in fields(Gradients):
+            assert not bool(getattr(gradients, field.name).any()), field.name
+
+
+def images(height: int, width: int) -> tuple[Tensor, Tensor]:
+    rng = torch.Generator().manual_seed(height * 1000 + width)
+    target = torch.rand(height, width, 3, generator=rng)
+    return (target + 0.3 * torch.randn(height, width, 3, generator=rng)).clamp(0, 1), target
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 3), (16, 16), (37, 70)])
+@pytest.mark.parametrize("lambda_dssim", [0.0, 0.2, 1.0])
+def test_photometric(backend: Backend, height: int, width: int, lambda_dssim: float) -> None:
+    rendered, target = images(height, width)
+    got = backend.photometric(rendered, target, lambda_dssim)
+    expected = ORACLE.photometric(rendered.double(), target.double(), lambda_dssim)
+    for name in ("l1", "ssim", "loss"):
+        assert getattr(got, name) == pytest.approx(getattr(expected, name), abs=LOSS), name
+    error = torch.linalg.vector_norm(got.v_colors - expected.v_colors)
+    assert float(error) <= SSIM_GRADIENT * float(torch.linalg.vector_norm(expected.v_colors))
+
+
+def test_equal_images_have_no_loss(backend: Backend) -> None:
+    _, target = images(20, 18)
+    got = backend.photometric(target, target.clone(), 0.2)
+    assert got.l1 == 0
+    assert got.ssim == pytest.approx(1, abs=LOSS)
+    # At the maximum of SSIM the gradient is zero; sign(0) = 0 leaves nothing of L1.
+    assert float(got.v_colors.abs().max()) * target.numel() <= SSIM_GRADIENT
+
+
+@pytest.mark.parametrize("shape", [(5,), (7, 3), (3, 15, 3), (0, 3), (1000, 4)])
+def test_adam(backend: Backend, shape: tuple[int, ...]) -> None:
+    rng = torch.Generator().manual_seed(0)
+    tensors = [torch.randn(shape, generator=rng) for _ in range(2)]
+    mine = [tensors[0].clone(), torch.zeros(shape), torch.zeros(shape)]
+    truth = [tensor.double() for tensor in mine]
+    for step in (1, 2, 3):
+        grad = torch.randn(shape, generator=rng) * 10.0 ** (-3 * step)
+        before = truth[0].clone()
+        options: dict[str, Any] = {"lr": 1e-2, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "step": step}
+        backend.adam(mine[0], grad, mine[1], mine[2], **options)
+        ORACLE.adam(truth[0], grad.double(), truth[1], truth[2], **options)
+        scale = max(1.0, float((truth[0] - before).abs().sum()), float(before.abs().sum()))
+        for got, expected in zip(mine, truth, strict=True):
+            assert float((got - expected).abs().sum()) <= ADAM * scale
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    case = single(make_case(5, count=200, width=67, height=35))
+    target = images(35, 67)[1]
+    results = []
+    for threads in (1, 3):
+        engine = built("cpu", threads)
+        frame = draw(engine, case)
+        gradients = engine.backward(frame, *(v.float() for v in weights_like(case)), absgrad=True)
+        photometric = engine.photometric(frame.colors, target, 0.2)
+        tensors = [frame.colors, frame.alphas, frame.radii, photometric.v_colors]
+        tensors += [getattr(gradients, field.name) for field in fields(Gradients)]
+        results.append((tensors, photometric.loss))
+    assert results[0][1] == results[1][1]
+    assert all(torch.equal(one, three) for one, three in zip(results[0][0], results[1][0], strict=True))
