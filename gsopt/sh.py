@@ -1,7 +1,7 @@
 """Real spherical harmonics to band 3, in the order and with the signs that the field's files use.
 
 Band l holds m = -l .. l. Each function carries the Condon-Shortley sign (-1)^m, so band 1 is (-y, z, -x) times
-sqrt(3 / 4 pi); the polynomials hold for unit directions (docs/math.md, 6; Sloan 2013, "Efficient Spherical
+sqrt(3 / 4 pi); the polynomials hold for unit directions (docs/math.md, eq. 17; Sloan 2013, "Efficient Spherical
 Harmonic Evaluation").
 """
 

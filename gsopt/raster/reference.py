@@ -188,7 +188,7 @@ def hard_threshold(raw: Float[Tensor, "P M"]) -> Float[Tensor, "P M"]:
 def raw_alphas(
     deltas: Float[Tensor, "P M 2"], conics: Float[Tensor, "M 3"], opacities: Float[Tensor, " M"]
 ) -> Float[Tensor, "P M"]:
-    """o · exp(-½ dᵀ conic d), d = pixel - mean2d."""
+    """o · exp(-½ dᵀ conic d), d = pixel - mean2d, eq. 7."""
     dx, dy = deltas.unbind(-1)
     a, b, c = conics.unbind(-1)
     return opacities * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
@@ -323,7 +323,7 @@ class ReferenceBackend:
         return weights @ splats.colors + T_final[:, None] * background, 1 - T_final, weights @ splats.depths
 
     def _means2d_abs(self, tape: Tape, v: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "N 2"]:
-        """Σ over pixels of |dLoss/dmean2d through that pixel|: the gradient of each pixel's own deltas, eq. 10."""
+        """Σ over pixels of |dLoss/dmean2d through that pixel|: the gradient of each pixel's own deltas, eq. 11."""
         height, width = tape.alphas.shape
         total = torch.zeros_like(tape.splats.means2d)
         begin = 0

@@ -1,7 +1,7 @@
 """L1 and structural similarity (Wang et al. 2004) as Gaussian splatting trains with them: their one home in torch.
 
 SSIM has an 11x11 Gaussian window of sigma 1.5 px, zero padding, biased (window-weighted) variances, a dynamic range
-of 1, and is taken per channel. The gradient that the compiled kernels write out is derived in docs/math.md, 7.
+of 1, and is taken per channel. The gradient that the compiled kernels write out is derived in docs/math.md, eqs. 19-21.
 """
 
 from __future__ import annotations
