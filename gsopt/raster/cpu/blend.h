@@ -23,35 +23,42 @@ inline void store_state(StoredState& s, const BlockState& v) {
   store_pxi(s.last, v.last);
 }
 
-// Blends the splats named by `words` into one block; false once every pixel has terminated.
-// Blends the splats named by `words` into one block; false once every pixel has terminated.
+template <bool Depth> inline void blend_one(BlockState& s, pxi pass, px alpha, const Local& local, int j) {
+  const px weight = keep(pass, alpha) * s.T;
+  s.r = s.r + weight * splat<px>(local.r[j]);
+  s.g = s.g + weight * splat<px>(local.g[j]);
+  s.b = s.b + weight * splat<px>(local.b[j]);
+  if (Depth) s.depth = s.depth + weight * splat<px>(local.depth[j]);
+  s.T = s.T - weight;
+  s.last = max(s.last, pass & splat_pxi(kOneBased.at[j]));
+}
+
+// Blends the splats named by `words` into one block, two at a time; false once every pixel has terminated.
 template <bool Depth, bool Count>
-inline bool blend_block(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, StoredState& stored,
-                        Work& work) {
+inline bool blend_block(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, int count,
+                        StoredState& stored, Work& work) {
+  uint16_t buffer[kChunk + 2];
+  const int n = list_block(words, n_words, block, kChunk, count, buffer);
+  const uint16_t* list = buffer + 1;
   px X, Y;
   block_pixels(block, X, Y);
   BlockState s = load_state(stored);
+  const pxi before = s.last;
+  s.last = splat_pxi(0);  // one-based within the chunk, 0 = none
   const px t_min = splat<px>(kTransmittanceMin), threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
-  pxi alive = s.T > t_min, last = splat_pxi(0);  // one-based within the chunk, 0 = none
-  for (int w = 0; w < n_words; ++w) {
-    for (uint64_t rest = words[w][block]; rest; rest &= rest - 1) {
-      const int j = 64 * w + __builtin_ctzll(rest);
-      const Exponent x = exponent(local, j, X, Y);
-      const pxi pass = (x.e >= threshold) & alive;
-      const px weight = keep(pass, min(exp2(x.e), alpha_max)) * s.T;
-      s.r = s.r + weight * splat<px>(local.r[j]);
-      s.g = s.g + weight * splat<px>(local.g[j]);
-      s.b = s.b + weight * splat<px>(local.b[j]);
-      if (Depth) s.depth = s.depth + weight * splat<px>(local.depth[j]);
-      s.T = s.T - weight;
-      last = max(last, pass & splat_pxi(kOneBased.at[j]));
-      if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(pass));
-      alive = s.T > t_min;
-      if (!any(alive)) goto done;
-    }
+  pxi alive = s.T > t_min;
+  for (int k = 0; k < n && any(alive); k += 2) {
+    const int i = list[k], j = list[k + 1];
+    const Exponents x = exponents(local, i, j, X, Y);
+    const px2 alpha = exp2(x.e);
+    const pxi pass_i = (x.e.a >= threshold) & alive;
+    blend_one<Depth>(s, pass_i, min(alpha.a, alpha_max), local, i);
+    const pxi pass_j = (x.e.b >= threshold) & (s.T > t_min);
+    blend_one<Depth>(s, pass_j, min(alpha.b, alpha_max), local, j);
+    alive = s.T > t_min;
+    if (Count) work.entries += 1 + (j != count), work.pairs += __builtin_popcount(movemask(pass_i)) + __builtin_popcount(movemask(pass_j));
   }
-done:
-  s.last = max(s.last, (last > splat_pxi(0)) & (last + splat_pxi(first - 1)));
+  s.last = max(before, (s.last > splat_pxi(0)) & (s.last + splat_pxi(first - 1)));
   store_state(stored, s);
   return any(alive);
 }
@@ -84,7 +91,7 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
     load_chunk(frame, frame.entries.as<Entry>() + first, n, geometry, local, words);
     for (uint32_t rest = alive; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest);
-      if (!blend_block<Depth, Count>(local, words, n_words, block, static_cast<int>(first - begin), state[block], work)) alive &= ~(1u << block);
+      if (!blend_block<Depth, Count>(local, words, n_words, block, static_cast<int>(first - begin), n, state[block], work)) alive &= ~(1u << block);
     }
     words += n_words;
   }

@@ -104,47 +104,56 @@ inline void flush(Batch& batch, const BlockGradient& grad, int block, float (*ro
   batch.size = 0;
 }
 
-// Phase one over one chunk of one block, last splat first.
+// What phase one carries from splat to splat, back to front.
+struct BackwardState {
+  px T, behind;
+};
+
+// One splat of phase one; its s and w go into the batch.
 template <bool Depth, bool Abs>
-inline void blend_block_backward(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first,
+inline void one_backward(BackwardState& state, const Local& local, int j, pxi pass, px raw, px u, px v, const BlockGradient& grad, Batch& batch) {
+  const px alpha_max = splat<px>(kAlphaMax), one = splat<px>(1.f);
+  const px alpha = keep(pass, min(raw, alpha_max));
+  state.T = state.T * (one / (one - alpha));
+  const px weight = alpha * state.T;
+  px q = splat<px>(local.r[j]) * load_px(grad.r) + splat<px>(local.g[j]) * load_px(grad.g) + splat<px>(local.b[j]) * load_px(grad.b);
+  if (Depth) q = q + splat<px>(local.depth[j]) * load_px(grad.depth);
+  const px difference = q - state.behind;
+  state.behind = state.behind + alpha * difference;
+  const px s = keep(raw < alpha_max, weight * difference);  // a clamped alpha does not move
+  const int k = batch.size++;
+  batch.index[k] = j;
+  store_px(batch.s[k], s), store_px(batch.w[k], weight);
+  if (Abs) {
+    batch.abs_x[k] = sum(abs(s * u)) * local.A[j] * (1.f / kHalfLog2E);
+    batch.abs_y[k] = sum(abs(s * (splat<px>(local.B[j]) * u + splat<px>(local.C[j]) * v))) * (1.f / kHalfLog2E);
+  }
+}
+
+// Phase one over one chunk of one block, last splat first, two at a time.
+template <bool Depth, bool Abs>
+inline void blend_block_backward(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, int count,
                                  BlockGradient& grad, float (*rows)[kRow]) {
+  uint16_t list[kChunk + 2];
+  // Splats after the block's last one contributed nothing.
+  const int n = list_block(words, n_words, block, grad.highest - first, count, list);
   px X, Y;
   block_pixels(block, X, Y);
-  px T = load_px(grad.T), behind = load_px(grad.behind);
-  const px gr = load_px(grad.r), gg = load_px(grad.g), gb = load_px(grad.b), gz = load_px(grad.depth);
+  BackwardState state = {load_px(grad.T), load_px(grad.behind)};
   const pxi last = load_pxi(grad.last);
-  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax), one = splat<px>(1.f);
+  const px threshold = splat<px>(kLog2AlphaMin);
   Batch batch;
-  for (int w = n_words - 1; w >= 0; --w) {
-    uint64_t rest = words[w][block];
-    const int above = grad.highest - first - 64 * w;  // splats after the block's last one contributed nothing
-    if (above < 63) rest &= above < 0 ? 0 : (uint64_t{2} << above) - 1;
-    while (rest) {
-      const int bit = 63 - __builtin_clzll(rest), j = 64 * w + bit;
-      rest ^= uint64_t{1} << bit;
-      const auto [u, v, e] = exponent(local, j, X, Y);
-      const pxi pass = (e >= threshold) & (last >= splat_pxi(first + j));
-      const px raw = exp2(e);
-      const px alpha = keep(pass, min(raw, alpha_max));
-      T = T * (one / (one - alpha));
-      const px weight = alpha * T;
-      px q = splat<px>(local.r[j]) * gr + splat<px>(local.g[j]) * gg + splat<px>(local.b[j]) * gb;
-      if (Depth) q = q + splat<px>(local.depth[j]) * gz;
-      const px difference = q - behind;
-      behind = behind + alpha * difference;
-      const px s = keep(raw < alpha_max, weight * difference);  // a clamped alpha does not move
-      const int k = batch.size;
-      batch.index[k] = j;
-      store_px(batch.s[k], s), store_px(batch.w[k], weight);
-      if (Abs) {
-        batch.abs_x[k] = sum(abs(s * u)) * local.A[j] * (1.f / kHalfLog2E);
-        batch.abs_y[k] = sum(abs(s * (splat<px>(local.B[j]) * u + splat<px>(local.C[j]) * v))) * (1.f / kHalfLog2E);
-      }
-      if (++batch.size == kLanes) flush<Depth, Abs>(batch, grad, block, rows);
-    }
+  for (int k = n; k > 0; k -= 2) {  // list[0] is nowhere and pairs with the first splat of an odd list
+    const int i = list[k], j = list[k - 1];
+    const Exponents x = exponents(local, i, j, X, Y);
+    const px2 raw = exp2(x.e);
+    const pxi pass_i = (x.e.a >= threshold) & (last >= splat_pxi(first + i)), pass_j = (x.e.b >= threshold) & (last >= splat_pxi(first + j));
+    one_backward<Depth, Abs>(state, local, i, pass_i, raw.a, x.u.a, x.v.a, grad, batch);
+    one_backward<Depth, Abs>(state, local, j, pass_j, raw.b, x.u.b, x.v.b, grad, batch);
+    if (batch.size == kLanes) flush<Depth, Abs>(batch, grad, block, rows);
   }
   flush<Depth, Abs>(batch, grad, block, rows);
-  store_px(grad.T, T), store_px(grad.behind, behind);
+  store_px(grad.T, state.T), store_px(grad.behind, state.behind);
 }
 
 // Moments about the tile's centre become moments about each splat's own centre; the rows go to their slots.
@@ -186,15 +195,15 @@ template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& fra
   const uint32_t used = static_cast<uint32_t>(highest + 1);
   clear_rows(entries, used, count, frame.rows.as<float>());
   Local local;
-  alignas(64) float rows[kChunk][kRow];
+  alignas(64) float rows[kChunk + kLanes][kRow];  // the row of nowhere is never stored
   for (int chunk = divide_up(used, kChunk) - 1; chunk >= 0; --chunk) {
     const uint32_t first = static_cast<uint32_t>(chunk) * kChunk;
-    const int n = used - first < kChunk ? static_cast<int>(used - first) : kChunk, padded = (n + kLanes - 1) / kLanes * kLanes;
+    const int n = used - first < kChunk ? static_cast<int>(used - first) : kChunk, padded = (n + kLanes) / kLanes * kLanes;
     load_chunk(frame, entries + first, n, geometry, local, nullptr);
     std::memset(rows, 0, sizeof(rows[0]) * padded);
     for (int block = 0; block < kBlocks; ++block) {
       if (grad[block].highest < static_cast<int>(first)) continue;
-      blend_block_backward<Depth, Abs>(local, words + first / 64, (n + 63) / 64, block, static_cast<int>(first), grad[block], rows);
+      blend_block_backward<Depth, Abs>(local, words + first / 64, (n + 63) / 64, block, static_cast<int>(first), n, grad[block], rows);
     }
     store_rows(local, entries + first, n, rows, frame.rows.as<float>());
   }

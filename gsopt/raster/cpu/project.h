@@ -151,21 +151,20 @@ inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (
   v_direction[2] = dz[0] * v[0] + dz[1] * v[1] + dz[2] * v[2];
 }
 
-// The rows of one splat, summed in slot order; null rows give zeros.
-inline void sum_rows(const Frame& frame, const Record& record, float out[kRow]) {
+// The rows of one splat, summed in slot order; false when all are zero: it is in the image, but hidden.
+inline bool sum_rows(const Frame& frame, const Record& record, float out[kRow]) {
   const float* row = frame.rows.as<float>() + static_cast<int64_t>(record.slot) * kRow;
   f8 a = splat<f8>(0.f), b = a;
   for (uint32_t k = 0; k < record.count; ++k, row += kRow) a += load8(row), b += load8(row + 8);
   store8(out, a), store8(out + 8, b);
+  return any((a != 0.f) | (b != 0.f));
 }
 
 inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kLanes],
-                                   int lanes) {
+                                   const float sums[kLanes][kRow], int lanes) {
   const Camera& cam = frame.camera;
   const Record* records = frame.records.as<Record>();
-  alignas(64) float sums[kLanes][kRow];
   f8 field[kRow];
-  for (int l = 0; l < kLanes; ++l) sum_rows(frame, records[index[l]], sums[l]);
   for (int h = 0; h < 2; ++h) {
     for (int l = 0; l < 8; ++l) field[8 * h + l] = load8(sums[l] + 8 * h);
     transpose8(field + 8 * h);
@@ -225,25 +224,26 @@ inline void zero_gradient(const Parameters& P, const ParameterGradients& G, int6
   std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
 }
 
-// Gaussians that are in no tile get zeros; the others are packed into full vectors, in index order.
+// Gaussians that no pixel saw get zeros; the others are packed into full vectors, in index order.
 inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P, const ParameterGradients& G) {
   const Record* records = frame.records.as<Record>();
   parallel(pool, divide_up(P.count, kProjectChunk), [&](int chunk, int) {
     const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
     const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
     int64_t index[kLanes];
+    alignas(64) float sums[kLanes][kRow] = {};
     int lanes = 0;
     for (int64_t n = begin; n < end; ++n) {
-      if (records[n].count == 0) {
+      if (records[n].count == 0 || !sum_rows(frame, records[n], sums[lanes])) {
         zero_gradient(P, G, n);
         continue;
       }
       index[lanes++] = n;
-      if (lanes == kLanes) project_backward_lanes(frame, P, G, index, lanes), lanes = 0;
+      if (lanes == kLanes) project_backward_lanes(frame, P, G, index, sums, lanes), lanes = 0;
     }
     if (lanes) {
       for (int l = lanes; l < kLanes; ++l) index[l] = index[0];
-      project_backward_lanes(frame, P, G, index, lanes);
+      project_backward_lanes(frame, P, G, index, sums, lanes);
     }
   });
 }

@@ -72,7 +72,8 @@ inline f8 clamp(f8 x, f8 lo, f8 hi) { return min(max(x, lo), hi); }
 
 inline float sum(f8 a) { return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7])); }
 
-// 16 pixels: one register of AVX-512, or two of 8 lanes. Masks are integers, all ones where true.
+inline i8 shift_exponent(i8 n) { return n << 23; }
+
 #if defined(__AVX512F__)
 using f16 = float __attribute__((vector_size(64)));
 using i16 = int32_t __attribute__((vector_size(64)));
@@ -89,58 +90,46 @@ inline int movemask(i16 m) { return _mm512_movepi32_mask((__m512i)m); }
 inline bool any(i16 m) { return movemask(m) != 0; }
 inline float sum(f16 a) { return _mm512_reduce_add_ps((__m512)a); }
 inline i16 shift_exponent(i16 n) { return n << 23; }
-
-#else
-struct i16 {
-  i8 lo, hi;
-};
-struct f16 {
-  f8 lo, hi;
-};
-inline f16 operator+(f16 a, f16 b) { return {a.lo + b.lo, a.hi + b.hi}; }
-inline f16 operator-(f16 a, f16 b) { return {a.lo - b.lo, a.hi - b.hi}; }
-inline f16 operator*(f16 a, f16 b) { return {a.lo * b.lo, a.hi * b.hi}; }
-inline f16 operator/(f16 a, f16 b) { return {a.lo / b.lo, a.hi / b.hi}; }
-inline i16 operator+(i16 a, i16 b) { return {a.lo + b.lo, a.hi + b.hi}; }
-inline i16 operator&(i16 a, i16 b) { return {a.lo & b.lo, a.hi & b.hi}; }
-inline i16 operator>(f16 a, f16 b) { return {a.lo > b.lo, a.hi > b.hi}; }
-inline i16 operator>=(f16 a, f16 b) { return {a.lo >= b.lo, a.hi >= b.hi}; }
-inline i16 operator<(f16 a, f16 b) { return {a.lo < b.lo, a.hi < b.hi}; }
-inline i16 operator>(i16 a, i16 b) { return {a.lo > b.lo, a.hi > b.hi}; }
-inline i16 operator>=(i16 a, i16 b) { return {a.lo >= b.lo, a.hi >= b.hi}; }
-template <> inline f16 splat<f16>(float x) { return {splat<f8>(x), splat<f8>(x)}; }
-inline i16 bits(f16 v) { return {bits(v.lo), bits(v.hi)}; }
-inline f16 from_bits(i16 v) { return {from_bits(v.lo), from_bits(v.hi)}; }
-inline f16 keep(i16 m, f16 a) { return {keep(m.lo, a.lo), keep(m.hi, a.hi)}; }
-inline f16 min(f16 a, f16 b) { return {min(a.lo, b.lo), min(a.hi, b.hi)}; }
-inline i16 max(i16 a, i16 b) { return {max(a.lo, b.lo), max(a.hi, b.hi)}; }
-inline f16 abs(f16 a) { return {abs(a.lo), abs(a.hi)}; }
-inline int movemask(i16 m) { return movemask(m.lo) | movemask(m.hi) << 8; }
-inline bool any(i16 m) { return any(m.lo | m.hi); }
-inline float sum(f16 a) { return sum(a.lo + a.hi); }
-inline i16 shift_exponent(i16 n) { return {n.lo << 23, n.hi << 23}; }
 #endif
 
-// The 4x4 pixels of a block, one per lane.
+// The pixels of a block, one per lane: 4x4 in one register of AVX-512, else 4x2 in one of 8 lanes.
+// Masks are integers, all ones where true.
+#if defined(__AVX512F__)
 using px = f16;
 using pxi = i16;
-constexpr int kPixels = 16;
-constexpr int kBlocks = 256 / kPixels;  // blocks of a 16x16 tile
-#if defined(__AVX512F__)
 inline px load_px(const float* p) { return *reinterpret_cast<const f16u*>(p); }
 inline void store_px(float* p, px v) { *reinterpret_cast<f16u*>(p) = v; }
 inline pxi load_pxi(const int32_t* p) { return *reinterpret_cast<const i16u*>(p); }
 inline void store_pxi(int32_t* p, pxi v) { *reinterpret_cast<i16u*>(p) = v; }
 inline pxi splat_pxi(int32_t x) { return pxi{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
 #else
-inline px load_px(const float* p) { return {load8(p), load8(p + 8)}; }
-inline void store_px(float* p, px v) { store8(p, v.lo), store8(p + 8, v.hi); }
-inline pxi load_pxi(const int32_t* p) { return {load8i(p), load8i(p + 8)}; }
-inline void store_pxi(int32_t* p, pxi v) { store8i(p, v.lo), store8i(p + 8, v.hi); }
-inline pxi splat_pxi(int32_t x) { return {splat8i(x), splat8i(x)}; }
+using px = f8;
+using pxi = i8;
+inline px load_px(const float* p) { return load8(p); }
+inline void store_px(float* p, px v) { store8(p, v); }
+inline pxi load_pxi(const int32_t* p) { return load8i(p); }
+inline void store_pxi(int32_t* p, pxi v) { store8i(p, v); }
+inline pxi splat_pxi(int32_t x) { return splat8i(x); }
 #endif
+constexpr int kPixels = sizeof(px) / sizeof(float);  // pixels of a block, always 4 wide
+constexpr int kBlocks = 256 / kPixels;               // blocks of a 16x16 tile
 
-inline i8 shift_exponent(i8 n) { return n << 23; }
+// Two splats side by side. An exponential is one long chain of dependent operations; two chains written in lockstep
+// keep both multipliers busy, which the processor's window is too short to find by itself.
+struct pxi2 {
+  pxi a, b;
+};
+struct px2 {
+  px a, b;
+};
+inline px2 operator+(px2 x, px2 y) { return {x.a + y.a, x.b + y.b}; }
+inline px2 operator-(px2 x, px2 y) { return {x.a - y.a, x.b - y.b}; }
+inline px2 operator*(px2 x, px2 y) { return {x.a * y.a, x.b * y.b}; }
+inline pxi2 operator+(pxi2 x, pxi2 y) { return {x.a + y.a, x.b + y.b}; }
+template <> inline px2 splat<px2>(float x) { return {splat<px>(x), splat<px>(x)}; }
+inline pxi2 bits(px2 v) { return {bits(v.a), bits(v.b)}; }
+inline px2 from_bits(pxi2 v) { return {from_bits(v.a), from_bits(v.b)}; }
+inline pxi2 shift_exponent(pxi2 n) { return {shift_exponent(n.a), shift_exponent(n.b)}; }
 
 // 2^x for |x| < 126, relative error 1.5e-7: minimax polynomial of degree 5 on [-1/2, 1/2] (Remez, relative weight)
 // times a power of two put together from its bits. Outside that range the result is arbitrary but harmless: mask it.

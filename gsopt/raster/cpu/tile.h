@@ -10,8 +10,9 @@ constexpr int kBlockRows = kPixels / 4, kStrips = kTile / kBlockRows;
 
 // exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
 struct Local {
-  alignas(64) float A[kChunk], B[kChunk], C[kChunk], u0[kChunk], v0[kChunk], log2_opacity[kChunk];
-  alignas(64) float r[kChunk], g[kChunk], b[kChunk], depth[kChunk], dx[kChunk], dy[kChunk];
+  static constexpr int kSize = kChunk + kLanes;  // the entry behind the last one is nowhere: it pads odd lists
+  alignas(64) float A[kSize], B[kSize], C[kSize], u0[kSize], v0[kSize], log2_opacity[kSize];
+  alignas(64) float r[kSize], g[kSize], b[kSize], depth[kSize], dx[kSize], dy[kSize];
 };
 
 struct TileGeometry {
@@ -48,34 +49,50 @@ inline i8 block_masks(f8 A, f8 B, f8 C, f8 lo, f8 dx, f8 dy) {
 
 // 0, 1, 2, ...: a broadcast from memory is cheaper than moving a counter into a vector register.
 struct Counting {
-  int32_t at[kChunk];
+  int32_t at[kChunk + 1];
   constexpr Counting() : at() {
-    for (int k = 0; k < kChunk; ++k) at[k] = k + 1;
+    for (int k = 0; k <= kChunk; ++k) at[k] = k + 1;
   }
 };
 inline constexpr Counting kOneBased;
 
-// Exponent of a splat at a block's pixels, and what its gradient is made of.
-struct Exponent {
-  px u, v, e;
+// Indices of the set bits of a block's words, ascending, up to `highest`; then one that is nowhere. Returns how many.
+inline int list_block(const uint64_t (*words)[kBlocks], int n_words, int block, int highest, int nowhere, uint16_t* list) {
+  int n = 1;  // one nowhere in front as well, for lists that are read from the back
+  list[0] = static_cast<uint16_t>(nowhere);
+  for (int w = 0; w < n_words; ++w) {
+    uint64_t rest = words[w][block];
+    const int above = highest - 64 * w;
+    if (above < 63) rest &= above < 0 ? 0 : (uint64_t{2} << above) - 1;
+    for (; rest; rest &= rest - 1) list[n++] = static_cast<uint16_t>(64 * w + __builtin_ctzll(rest));
+  }
+  list[n] = static_cast<uint16_t>(nowhere);
+  return n - 1;
+}
+
+// Exponents of two splats at a block's pixels, and what their gradients are made of.
+struct Exponents {
+  px2 u, v, e;
 };
-inline Exponent exponent(const Local& l, int j, px X, px Y) {
-  Exponent out;
-  out.u = splat<px>(l.A[j]) * X + (splat<px>(l.B[j]) * Y + splat<px>(l.u0[j]));
-  out.v = splat<px>(l.C[j]) * Y + splat<px>(l.v0[j]);
-  out.e = splat<px>(l.log2_opacity[j]) - out.v * out.v - out.u * out.u;  // v is ready first
+inline px2 splat_two(const float* p, int i, int j) { return {splat<px>(p[i]), splat<px>(p[j])}; }
+inline Exponents exponents(const Local& l, int i, int j, px X, px Y) {
+  const px2 XX = {X, X}, YY = {Y, Y};
+  Exponents out;
+  out.u = splat_two(l.A, i, j) * XX + (splat_two(l.B, i, j) * YY + splat_two(l.u0, i, j));
+  out.v = splat_two(l.C, i, j) * YY + splat_two(l.v0, i, j);
+  out.e = splat_two(l.log2_opacity, i, j) - out.v * out.v - out.u * out.u;  // v is ready first
   return out;
 }
 
 constexpr float kNowhere = -1e30f;  // log2_opacity of the padding
 
-// Loads entries [0, n) of a chunk; pads to a multiple of eight. With `words`, also the block masks: bit k of
+// Loads entries [0, n) of a chunk; pads to a multiple of eight, and at least by one. With `words`, also the block masks: bit k of
 // words[w][block] says whether splat 64 w + k touches the block.
 inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeometry tile, Local& local, uint64_t (*words)[kBlocks]) {
   static const Record nowhere = {0.f, 0.f, 1.f, 0.f, 1.f, kNowhere, 0.f, 0.f, 0.f, 1.f, 0, 0, 0, 0, 0, 0, {0, 0}};
   const Record* records = frame.records.as<Record>();
   if (words) std::memset(words, 0, sizeof(uint64_t) * kBlocks * ((n + 63) / 64));
-  for (int i = 0; i < n; i += kLanes) {
+  for (int i = 0; i <= n; i += kLanes) {
     f8 v[8];
     for (int l = 0; l < kLanes; ++l) {
       const Record& r = i + l < n ? records[entries[i + l].id] : nowhere;
@@ -88,7 +105,7 @@ inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeom
     store8(local.dx + i, dx), store8(local.dy + i, dy);
     store8(local.u0 + i, splat<f8>(0.f) - (A * dx + B * dy)), store8(local.v0 + i, splat<f8>(0.f) - C * dy);
     store8(local.log2_opacity + i, lo), store8(local.r + i, v[6]), store8(local.g + i, v[7]);
-    if (!words) continue;
+    if (!words || i >= n) continue;
     const i8 mask = block_masks(A, B, C, lo, dx, dy);
     uint64_t* word = words[i / 64];
     const int position = i & 63;
