@@ -18,7 +18,7 @@ from gsopt.data import files
 from gsopt.data.colmap_files import CameraRecord, ImageRecord, read_cameras, read_images, read_points
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
-from gsopt.data.source import Frame, Source, check_pose, summarize_names
+from gsopt.data.source import Frame, Source, check_enough, check_pose, summarize_names
 from gsopt.errors import InputError
 
 SUPPORTED = (
@@ -85,6 +85,7 @@ def _frames(
             absent.append(record.name)
             continue
         frames.append(_frame(root, record, cameras[record.camera_id], image, where, len(frames)))
+    check_enough(frames, absent, path)
     if absent:
         warnings.append(
             f"{path.name} poses {len(records)} images, {len(absent)} of them are absent from images/ and left out: "

@@ -15,6 +15,8 @@ from gsopt.errors import InputError
 def find_mask(folder: Path, name: str) -> Path | None:
     """The mask of image `name` (relative to its image folder): `name.ext.png` as COLMAP writes it, or `name.png`."""
     image = files.child(folder, name)
+    if image.is_absolute() != folder.is_absolute() or ".." in image.parts or not image.is_relative_to(folder):
+        image = folder / image.name  # the image lies elsewhere: never take it for its own mask
     for candidate in (image.with_name(image.name + ".png"), image.with_suffix(".png")):
         if files.is_regular(candidate):
             return candidate

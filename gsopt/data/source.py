@@ -65,6 +65,15 @@ def check_pose(matrix: Float[Tensor, "4 4"], where: str) -> None:
         raise InputError(f"The pose of {where} is not rigid: its last row is {bottom}, not 0 0 0 1. {remedy}")
 
 
+def check_enough(frames: list[Frame], absent: list[str], path: Path) -> None:
+    """InputError when so many of the images that `path` names are absent that no two remain."""
+    if absent and len(frames) < 2:
+        raise InputError(
+            f"Only {len(frames)} of the {len(frames) + len(absent)} images that {path} names exist; absent are "
+            f"{summarize_names(absent)}. Put them where the file says, or correct the file."
+        )
+
+
 def summarize_names(names: list[str], most: int = 5) -> str:
     """The first few names and how many more there are, for a warning of one line."""
     rest = len(names) - most

@@ -40,8 +40,6 @@ def _chosen(train: list[Frame], config: DataConfig, kind: str) -> list[Frame]:
 def _by_ids(train: list[Frame], ids: tuple[int, ...], kind: str) -> list[Frame]:
     # NeRF-synthetic counts rows of the file, so that ids keep their meaning when an image is absent.
     rows = {frame.position: frame for frame in train} if kind == "nerf-synthetic" else dict(enumerate(train))
-    if not ids:
-        raise UsageError("`--view-ids` is empty. Name at least one input view, or drop the flag.")
     for view in ids:
         if view not in rows:
             last = max(rows)

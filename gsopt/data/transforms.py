@@ -19,7 +19,7 @@ from gsopt.data.images import read_header
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
 from gsopt.data.pointcloud import read_points_ply
-from gsopt.data.source import Frame, Source, check_pose, summarize_names
+from gsopt.data.source import Frame, Source, check_enough, check_pose, summarize_names
 from gsopt.errors import InputError
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG")
@@ -33,11 +33,12 @@ def read_transforms(root: Path) -> Source:
     path = root / ("transforms_train.json" if synthetic else "transforms.json")
     document = files.read_json(path)
     warnings: list[str] = []
-    frames = read_frames(document, path, warnings)
+    frames, absent = read_frames(document, path, warnings)
+    check_enough(frames, absent, path)
     held_out: list[Frame] | None = None
     for name in ("transforms_test.json", "transforms_val.json"):
         if held_out is None and files.is_regular(root / name):
-            held_out = read_frames(files.read_json(root / name), root / name, warnings)
+            held_out, _ = read_frames(files.read_json(root / name), root / name, warnings)
     if held_out is None and isinstance(document.get("test_filenames"), list):
         held_out, frames = _pick_test(frames, document["test_filenames"], root)
     if not synthetic:
@@ -46,8 +47,8 @@ def read_transforms(root: Path) -> Source:
     return Source("nerf-synthetic" if synthetic else "nerfstudio", frames, held_out, xyz, rgb, warnings)
 
 
-def read_frames(document: dict[str, Any], path: Path, warnings: list[str]) -> list[Frame]:
-    """The frames whose image exists, in file order; the others are named in `warnings`."""
+def read_frames(document: dict[str, Any], path: Path, warnings: list[str]) -> tuple[list[Frame], list[str]]:
+    """The frames whose image exists, in file order, and the names of the others, which `warnings` tells of."""
     entries = document.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} has no list `frames` with at least one entry. Export the dataset again.")
@@ -66,7 +67,7 @@ def read_frames(document: dict[str, Any], path: Path, warnings: list[str]) -> li
             f"{path.name} names {len(entries)} frames, the images of {len(absent)} are absent and left out: "
             f"{summarize_names(absent)}."
         )
-    return frames
+    return frames, absent
 
 
 def _find_image(root: Path, file_path: str) -> Path | None:

@@ -1,0 +1,83 @@
+"""--views, --view-ids and the held-out views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from dataset_builders import nerf_synthetic, nerfstudio
+
+from gsopt.config import DataConfig
+from gsopt.data.scene import load_scene
+from gsopt.data.split import farthest_points
+from gsopt.errors import UsageError
+
+
+def names(root: Path, **settings: object) -> list[str]:
+    return [view.name for view in load_scene(DataConfig(path=str(root), **settings)).train]  # type: ignore[arg-type]
+
+
+def test_farthest_points_start_at_the_middle_and_each_is_the_farthest_from_those_before() -> None:
+    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    chosen = farthest_points(points, 12)
+    assert chosen[0] == int((points - points.mean(0)).norm(dim=1).argmin())
+    gaps = torch.cdist(points, points)
+    for i in range(1, 12):
+        assert chosen[i] == int(gaps[:, chosen[:i]].amin(dim=1).argmax())
+
+
+def test_farthest_points_do_not_depend_on_order_and_are_nested() -> None:
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    chosen = farthest_points(points, 9)
+    assert farthest_points(points, 5) == chosen[:5]
+    shuffled = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    assert [int(shuffled[i]) for i in farthest_points(points[shuffled], 9)] == chosen
+
+
+def test_cameras_in_one_place_are_chosen_once_each() -> None:
+    assert farthest_points(torch.zeros(5, 3, dtype=torch.float64), 5) == [0, 1, 2, 3, 4]
+
+
+def test_views_are_spread_and_in_list_order(tmp_path: Path) -> None:
+    root = nerf_synthetic(tmp_path)
+    chosen = names(root, views=4)
+    assert len(set(chosen)) == 4
+    assert chosen == sorted(chosen)
+    assert names(root, views=10) == names(root)
+
+
+def test_view_ids_count_rows_of_the_file_for_nerf_synthetic_even_when_an_image_is_absent(tmp_path: Path) -> None:
+    root = nerf_synthetic(tmp_path)
+    (tmp_path / "train" / "r_2.png").unlink()
+    assert names(root, view_ids=(5, 1)) == ["train/r_5.png", "train/r_1.png"]
+    with pytest.raises(UsageError, match="names 2, but its image is absent"):
+        names(root, view_ids=(2,))
+
+
+def test_view_ids_count_in_name_order_after_the_hold_out_elsewhere(tmp_path: Path) -> None:
+    root = nerfstudio(tmp_path)
+    assert names(root, view_ids=(0, 1)) == ["images/000.png", "images/001.png"]
+    assert names(root, view_ids=(0, 1), eval=True) == ["images/001.png", "images/002.png"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"view_ids": (10,)}, "names 10, but ids go from 0 to 9"),
+        ({"view_ids": (-1,)}, "view-ids"),
+        ({"view_ids": (3, 3)}, "twice"),
+        ({"view_ids": ()}, "view-ids"),
+        ({"views": 11}, "at most the 10 input views there are, got 11"),
+    ],
+)
+def test_impossible_choices_are_refused(tmp_path: Path, settings: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        names(nerf_synthetic(tmp_path), **settings)
+
+
+def test_the_test_views_stay_whatever_is_chosen(tmp_path: Path) -> None:
+    root = nerf_synthetic(tmp_path)
+    for settings in ({}, {"views": 2}, {"view_ids": (1,)}, {"eval": True}):
+        scene = load_scene(DataConfig(path=str(root), **settings))  # type: ignore[arg-type]
+        assert [view.name for view in scene.test] == [f"test/r_{i}.png" for i in range(3)]
