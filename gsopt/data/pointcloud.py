@@ -25,11 +25,12 @@ def read_points_ply(path: Path) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 
     except (PlyParseError, KeyError, OSError, ValueError, IndexError, MemoryError) as error:
         raise InputError(f"Cannot read the points {path}: {error}. Export them again, or remove the file.") from error
     rgb = np.full(xyz.shape, 128, dtype=np.uint8)
+    kept = np.isfinite(xyz).all(axis=1)
     if {"red", "green", "blue"} <= set(vertices.dtype.names or ()):
         columns = np.stack([np.asarray(vertices[name], dtype=np.float64) for name in ("red", "green", "blue")], axis=1)
         scale = 1 if vertices["red"].dtype.kind in "iu" else 255
-        rgb = np.clip(np.nan_to_num(columns * scale), 0, 255).astype(np.uint8)
-    kept = np.isfinite(xyz).all(axis=1)
+        kept &= np.isfinite(columns).all(axis=1)
+        rgb[kept] = np.clip(columns[kept] * scale, 0, 255).astype(np.uint8)
     return torch.from_numpy(xyz[kept]), torch.from_numpy(rgb[kept])
 
 

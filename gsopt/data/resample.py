@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 
-def downscaled_size(extent: int, factor: int) -> int:
+def downscaled_size(extent: int, factor: float) -> int:
     """round(extent / factor), halves up, at least 1: what the published images_2, images_4 folders have."""
     return max(1, math.floor(extent / factor + 0.5))
 

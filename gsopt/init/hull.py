@@ -27,7 +27,7 @@ COARSE = 48
 """Voxels along each side of the first grid."""
 _LOOKUPS = 6e7
 """Voxels times views of the second grid: bounds its time."""
-_SIDE_LOW, _SIDE_HIGH = 48, 144
+_SIDE_LOW, _SIDE_HIGH = 48, 112
 _SOLID = 0.5
 """Alpha above which a pixel belongs to the object."""
 _FULL = 0.98

@@ -1,0 +1,168 @@
+"""Which method makes the first Gaussians, and what they are like."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from shapes import ellipsoid_scene, spread_cameras
+
+from gsopt.cameras import Cameras, look_at
+from gsopt.config import DataConfig, InitConfig
+from gsopt.data.scene import Points, Scene, load_scene
+from gsopt.errors import UsageError
+from gsopt.init import first_gaussians
+from gsopt.init.frustum import random_points
+from gsopt.init.neighbors import mean_neighbor_distance
+from gsopt.init.rig import find_focus, sees
+from gsopt.sh import rgb_from_sh0
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    root = ellipsoid_scene(tmp_path_factory.mktemp("scene"), spread_cameras(8), (0.0, 0.0, 0.0), (0.8, 0.6, 0.5))
+    return load_scene(root)
+
+
+def with_points(scene: Scene, count: int) -> Scene:
+    generator = torch.Generator().manual_seed(0)
+    xyz = torch.randn(count, 3, generator=generator)
+    rgb = torch.randint(0, 256, (count, 3), generator=generator, dtype=torch.uint8)
+    return dataclasses.replace(scene, points=Points(xyz, rgb))
+
+
+def test_auto_prefers_points_then_the_hull_then_random(scene: Scene) -> None:
+    config = InitConfig(count=200)
+    without_alpha = dataclasses.replace(scene, has_alpha=False)
+    for given, word in (
+        (with_points(scene, 100), "points that came with the scene"),
+        (with_points(scene, 99), "visual hull"),
+        (scene, "visual hull"),
+        (without_alpha, "random"),
+        (with_points(without_alpha, 99), "random"),
+    ):
+        gaussians, said = first_gaussians(given, config, 2, 0)
+        assert word in said
+        assert "\n" not in said
+        assert gaussians.validate().sh_degree == 2
+
+
+@pytest.mark.parametrize("method", ["points", "hull", "random"])
+def test_what_every_method_gives(scene: Scene, method: str) -> None:
+    given = with_points(scene, 150)
+    gaussians, said = first_gaussians(given, InitConfig(method=method, count=300), 3, 0)  # type: ignore[arg-type]
+    assert len(gaussians) == (150 if method == "points" else 300)
+    assert said
+    assert gaussians.shN.shape == (len(gaussians), 15, 3)
+    assert not bool(gaussians.shN.any())
+    assert torch.allclose(gaussians.opacities, torch.tensor(0.1))
+    assert torch.equal(gaussians.quats, torch.tensor([[1.0, 0, 0, 0]]).expand(len(gaussians), 4))
+    distance = mean_neighbor_distance(gaussians.means)
+    assert torch.allclose(gaussians.scales, distance[:, None].expand(-1, 3), rtol=1e-5)
+    colors = rgb_from_sh0(gaussians.sh0)
+    assert float(colors.min()) > -1e-6
+    assert float(colors.max()) < 1 + 1e-6
+    for _, tensor in gaussians.items():
+        assert tensor.dtype == torch.float32
+        assert not tensor.requires_grad
+
+
+def test_points_keep_their_places_and_colours(scene: Scene) -> None:
+    given = with_points(scene, 120)
+    gaussians, _ = first_gaussians(given, InitConfig(), 0, 0)
+    assert given.points is not None
+    assert torch.equal(gaussians.means, given.points.xyz)
+    assert torch.equal((rgb_from_sh0(gaussians.sh0[:, 0]) * 255).round().to(torch.uint8), given.points.rgb)
+
+
+@pytest.mark.parametrize("method", ["hull", "random"])
+def test_the_seed_decides_and_nothing_else(scene: Scene, method: str) -> None:
+    config = InitConfig(method=method, count=100)  # type: ignore[arg-type]
+    first, again, other = (first_gaussians(scene, config, 1, seed)[0] for seed in (5, 5, 6))
+    for (name, a), (_, b) in zip(first.items(), again.items(), strict=True):
+        assert torch.equal(a, b), name
+    assert not torch.equal(first.means, other.means)
+
+
+@pytest.mark.parametrize(("method", "message"), [("points", "needs a scene with points"), ("hull", "needs alpha")])
+def test_a_method_the_scene_cannot_serve_is_refused(scene: Scene, method: str, message: str) -> None:
+    bare = dataclasses.replace(scene, has_alpha=False)
+    with pytest.raises(UsageError, match=message):
+        first_gaussians(bare, InitConfig(method=method), 0, 0)  # type: ignore[arg-type]
+
+
+def test_random_points_are_seen_by_at_least_half_of_the_cameras_and_fill_the_view(scene: Scene) -> None:
+    cameras = [view.camera for view in scene.train]
+    focus = find_focus(cameras, scene.extent)
+    assert focus.converging
+    points = random_points(cameras, focus, 500, False, torch.Generator().manual_seed(0))
+    seen = torch.stack([sees(camera, points) for camera in cameras]).sum(0)
+    assert int(seen.min()) * 2 >= len(cameras)
+    # What half of the cameras see of a ball around the origin is not a corner of it.
+    assert float(points.mean(0).norm()) < 0.2
+    assert float(points.norm(dim=1).quantile(0.9)) > 1
+
+
+def test_the_focus_is_where_the_axes_meet() -> None:
+    target = torch.tensor([2.0, -1.0, 3.0], dtype=torch.float64)
+    rig = spread_cameras(7)
+    moved = dataclasses.replace(rig, viewmats=rig.viewmats.clone())
+    moved.viewmats[:, :3, 3] -= (rig.viewmats[:, :3, :3] @ target[:, None])[..., 0]
+    focus = find_focus([moved[i] for i in range(7)], 4.0)
+    assert torch.allclose(focus.point.double(), target, atol=1e-4)
+    assert focus.distance == pytest.approx(4.0, abs=1e-4)
+    assert focus.radius == pytest.approx(4 * math.tan(0.35), rel=1e-4)
+
+
+def rig_of(eyes: torch.Tensor, targets: torch.Tensor) -> list[Cameras]:
+    up = torch.tensor([0.0, 0, 1])
+    viewmats = torch.cat([look_at(e[None], t, up) for e, t in zip(eyes, targets, strict=True)])
+    model = spread_cameras(1).to(torch.float32)
+    return [dataclasses.replace(model, viewmats=viewmats[i : i + 1]) for i in range(len(eyes))]
+
+
+EYES = torch.tensor([[3.0, 0, 0], [0, 3.0, 0.1], [-3.0, 0.1, 0], [0.1, -3.0, 0]])
+RIGS = {
+    "two that face each other": rig_of(EYES[[0, 2]], torch.zeros(2, 3)),
+    "outward": rig_of(EYES, 2 * EYES),
+    "parallel": rig_of(EYES * 0.1, EYES * 0.1 + torch.tensor([9.0, 0, 0])),
+    "one": rig_of(EYES[:1], torch.zeros(1, 3)),
+    "one that looks past the origin": rig_of(EYES[:1], torch.tensor([[3.0, 5, 5]])),
+    "all in one place": rig_of(EYES[[0, 0, 0]], torch.tensor([[0.0, 0, 0], [0, 5, 0], [9, 9, 9]])),
+}
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_every_rig_gets_finite_points_before_some_camera(name: str) -> None:
+    cameras = RIGS[name]
+    focus = find_focus(cameras, 1.0)
+    points = random_points(cameras, focus, 200, True, torch.Generator().manual_seed(0))
+    assert points.shape == (200, 3)
+    assert bool(points.isfinite().all())
+    seen = torch.stack([sees(camera, points) for camera in cameras]).any(0)
+    assert float(seen.double().mean()) > 0.95
+
+
+def test_two_cameras_that_face_each_other_and_a_lone_one_look_at_the_origin() -> None:
+    for name in ("two that face each other", "one"):
+        assert float(find_focus(RIGS[name], 1.0).point.norm()) < 0.1
+
+
+def test_real_lego_from_eight_views(shared_data: Path) -> None:
+    scene = load_scene(DataConfig(path=str(shared_data / "views" / "nerf_synthetic_lego_400"), views=8))
+    gaussians, said = first_gaussians(scene, InitConfig(count=3000), 0, 0)
+    assert "visual hull of 8 silhouettes" in said
+    assert len(gaussians.validate()) == 3000
+    # Yellow bricks dominate: red and green above blue.
+    red, green, blue = rgb_from_sh0(gaussians.sh0[:, 0]).mean(0).tolist()
+    assert min(red, green) > blue + 0.1
+
+
+def test_real_fox_without_points_or_alpha(shared_data: Path) -> None:
+    scene = load_scene(DataConfig(path=str(shared_data / "views" / "fox"), views=3, downscale=4))
+    gaussians, said = first_gaussians(scene, InitConfig(count=300), 1, 0)
+    assert "300 random points" in said
+    gaussians.validate()

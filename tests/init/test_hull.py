@@ -1,0 +1,148 @@
+"""The visual hull of a known shape."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from shapes import BLUE, RED, ellipsoid_scene, spread_cameras
+
+from gsopt.config import InitConfig
+from gsopt.data.scene import Scene, load_scene
+from gsopt.errors import UsageError
+from gsopt.init import first_gaussians
+from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
+from gsopt.init.photos import small_photos
+from gsopt.init.rig import find_focus
+
+CENTER, RADII = (0.3, -0.2, 0.1), (0.9, 0.6, 0.4)
+
+
+def radius_in_ellipsoid(points: torch.Tensor) -> torch.Tensor:
+    """1 on the surface."""
+    return ((points - torch.tensor(CENTER)) / torch.tensor(RADII)).norm(dim=1)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("ellipsoid")
+    return load_scene(ellipsoid_scene(folder, spread_cameras(24), CENTER, RADII))
+
+
+@pytest.fixture(scope="module")
+def found(scene: Scene) -> HullPoints:
+    points = hull_points(scene, 4000, torch.Generator().manual_seed(0))
+    assert points is not None
+    return points
+
+
+def test_points_of_the_shape_are_in_the_hull_and_points_well_outside_are_not(scene: Scene) -> None:
+    photos = small_photos(scene.train, 100)
+    directions = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    surface = directions * torch.tensor(RADII)
+    assert bool(in_hull(photos, surface * 0.93 + torch.tensor(CENTER)).all())
+    assert float(in_hull(photos, surface * 1.25 + torch.tensor(CENTER)).double().mean()) < 0.01
+
+
+def test_more_views_carve_more(scene: Scene) -> None:
+    photos = small_photos(scene.train, 100)
+    points = 2 * torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) - 1
+    before = torch.ones(5000, dtype=torch.bool)
+    for count in (2, 4, 8, 24):
+        kept = in_hull(photos[:count], points)
+        assert not bool((kept & ~before).any())
+        assert int(kept.sum()) < int(before.sum())
+        before = kept
+
+
+def test_a_radius_only_adds_points(scene: Scene) -> None:
+    photos = small_photos(scene.train, 100)
+    points = 2 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 1
+    exact, wide = in_hull(photos, points), in_hull(photos, points, 0.2)
+    assert not bool((exact & ~wide).any())
+    assert int(wide.sum()) > int(exact.sum())
+
+
+def test_the_voxels_enclose_the_shape_tightly(scene: Scene) -> None:
+    photos = small_photos(scene.train, 100)
+    grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
+    assert grid is not None
+    volume = int(grid.occupied.sum()) * grid.voxel**3
+    true = 4 / 3 * torch.pi * RADII[0] * RADII[1] * RADII[2]
+    # Masks of 64 px without partial alpha take off up to a quarter pixel (4 %); 24 views leave little beside the shape.
+    assert true * 0.94 < volume < true * 1.15
+    centers = grid.centers(grid.occupied)
+    for axis in range(3):
+        assert float(centers[:, axis].amax()) == pytest.approx(CENTER[axis] + RADII[axis], abs=0.08)
+        assert float(centers[:, axis].amin()) == pytest.approx(CENTER[axis] - RADII[axis], abs=0.08)
+
+
+def test_every_sampled_point_is_in_the_hull_and_the_surface_has_its_share(scene: Scene, found: HullPoints) -> None:
+    assert len(found.xyz) == 4000
+    assert bool(in_hull(small_photos(scene.train, 100), found.xyz).all())
+    radius = radius_in_ellipsoid(found.xyz)
+    shell = float((radius > 1 - 2.5 * found.voxel / min(RADII)).double().mean())
+    assert SURFACE_SHARE - 0.02 < shell < SURFACE_SHARE + 0.2
+    assert float((radius < 0.5).double().mean()) > 0.01
+
+
+def test_colours_are_those_of_the_nearest_surface(found: HullPoints) -> None:
+    """Means over all views would mix both halves; only views that see the surface before a point may count."""
+    away = (found.xyz[:, 0] - CENTER[0]) / RADII[0]
+    for half, color in ((away > 0.35, RED), (away < -0.35, BLUE)):
+        error = (found.rgb[half] - torch.tensor(color) / 255).abs().amax(dim=1)
+        assert float(error.mean()) < 0.08
+        assert float((error < 0.1).double().mean()) > 0.85
+
+
+def test_the_hull_is_the_same_every_time_and_for_any_number_of_threads(scene: Scene, found: HullPoints) -> None:
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            again = hull_points(scene, 4000, torch.Generator().manual_seed(0))
+            assert again is not None
+            assert torch.equal(again.xyz, found.xyz)
+            assert torch.equal(again.rgb, found.rgb)
+    finally:
+        torch.set_num_threads(threads)
+    other = hull_points(scene, 4000, torch.Generator().manual_seed(1))
+    assert other is not None
+    assert not torch.equal(other.xyz, found.xyz)
+
+
+def test_an_object_thinner_than_a_voxel_is_found(tmp_path: Path) -> None:
+    root = ellipsoid_scene(tmp_path, spread_cameras(4, size=256), (0.0, 0.0, 0.0), (1.0, 0.02, 0.02))
+    gaussians, _ = first_gaussians(load_scene(root), InitConfig(method="hull", count=500), 0, 0)
+    assert float(gaussians.means[:, 0].amax()) > 0.9
+    assert float(gaussians.means[:, 1:].abs().amax()) < 0.1
+
+
+def test_an_object_cropped_by_some_views_keeps_its_cropped_part(tmp_path: Path) -> None:
+    cameras = spread_cameras(12)
+    near = spread_cameras(12, distance=1.9)
+    mixed = type(cameras).cat([cameras, near[::4]])
+    scene = load_scene(ellipsoid_scene(tmp_path, mixed, (0.0, 0.0, 0.0), (0.9, 0.9, 0.9)))
+    found = hull_points(scene, 2000, torch.Generator().manual_seed(0))
+    assert found is not None
+    assert float(found.xyz.norm(dim=1).amax()) > 0.85
+
+
+def blank(scene_root: Path, value: int) -> None:
+    from PIL import Image
+
+    for path in scene_root.glob("*.png"):
+        Image.new("RGBA", Image.open(path).size, (90, 90, 90, value)).save(path)
+
+
+@pytest.mark.parametrize("alpha", [0, 255])
+def test_silhouettes_that_outline_nothing_fall_back_or_say_so(tmp_path: Path, alpha: int) -> None:
+    root = ellipsoid_scene(tmp_path, spread_cameras(4), CENTER, RADII)
+    blank(root, alpha)
+    scene = load_scene(root)
+    gaussians, said = first_gaussians(scene, InitConfig(count=50), 0, 0)
+    assert len(gaussians.validate()) == 50
+    assert "random" in said
+    with pytest.raises(UsageError, match=r"--init\.method hull"):
+        first_gaussians(scene, InitConfig(method="hull", count=50), 0, 0)
