@@ -1,0 +1,75 @@
+"""Trains the scenes the README quotes and records what came out.
+
+    python benchmarks/scenes.py --root DATA [--case lego-100 ...] [--runs FOLDER]
+
+DATA holds `nerf_synthetic_lego_400` and `fox` (see `CASES`). Every case is one `gsopt train` in a process of its own;
+its held-out metrics, wall time, peak memory, the resolved configuration and the machine go into
+benchmarks/results/scenes.json, one record per case. Cases that were not asked for keep their records.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results" / "scenes.json"
+LEGO, FOX = "nerf_synthetic_lego_400", "fox"
+# The eight input views of the few-shot protocol (Jain et al. 2021).
+EIGHT = ["--view-ids", "2,16,26,55,73,75,86,93"]
+# The settings of Kerbl et al. 2023, nothing of ours: 100,000 random points, no regularizer for few views.
+PLAIN = ["--sparse.below-views", "0", "--init", "random", "--init-count", "100000", "--optimizer.lr-means", "1.6e-4"]
+PLAIN += ["--optimizer.lr-means-final", "1.6e-6", "--schedule.coarse-until", "--density.grow-grad2d", "2e-4"]
+CASES: dict[str, tuple[str, list[str]]] = {
+    "lego-100": (LEGO, []),
+    "lego-100-30k": (LEGO, ["--iterations", "30000"]),
+    "lego-8": (LEGO, EIGHT),
+    "lego-8-plain-3dgs": (LEGO, [*EIGHT, *PLAIN]),
+    "fox-quarter": (FOX, ["-r", "4", "--eval"]),
+}
+KEPT = ("mean", "per_view", "train_seconds", "peak_memory_mb", "n_gaussians", "protocol", "versions", "config")
+
+
+def run_case(name: str, root: Path, runs: Path) -> dict[str, Any]:
+    """Train one case into `runs`/name and return its record."""
+    folder, flags = CASES[name]
+    command = ["train", str(root / folder), "-m", str(runs / name), *flags]
+    subprocess.run([sys.executable, "-m", "gsopt", *command], check=True)
+    metrics = json.loads((runs / name / "metrics.json").read_text())
+    record = {key: metrics.get(key) for key in KEPT}
+    record["config"]["data"]["path"] = folder
+    return {"case": name, "flags": flags, **record, "machine": machine()}
+
+
+def machine() -> dict[str, Any]:
+    """What the figures depend on besides the code."""
+    cpu = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        models = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        cpu = models[0] if models else cpu
+    return {"cpu": cpu, "cores": os.cpu_count(), "python": platform.python_version(), "system": platform.system()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, required=True)
+    parser.add_argument("--case", nargs="*", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--runs", type=Path, default=Path("runs/bench"))
+    options = parser.parse_args()
+    for name in options.case:
+        record = run_case(name, options.root, options.runs)
+        records = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        RESULTS.write_text(json.dumps({**records, name: record}, indent=1) + "\n")
+        print(name, record["mean"], f"{record['train_seconds']:.0f} s", record["n_gaussians"], "Gaussians")
+
+
+if __name__ == "__main__":
+    main()
