@@ -20,7 +20,8 @@ from gsopt.init.rig import Focus, find_focus, inside, project
 
 SURFACE_SHARE = 0.7
 """Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and
-what is carved away during training must find Gaussians behind it to take over."""
+what is carved away during training must find Gaussians behind it to take over. On few views 0.4 to 0.7 do equally well
+and 1 (none inside) clearly worse."""
 MAX_PHOTOS = 100
 """Silhouettes used at most; more hardly carve."""
 COARSE = 48
