@@ -23,7 +23,7 @@ from tolerances import (
 )
 from torch import Tensor
 
-from gsopt.errors import MissingDependency
+from gsopt.errors import MissingDependency, UsageError
 from gsopt.gaussians import PARAMETERS
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
@@ -163,6 +163,14 @@ def test_no_gaussians_and_none_in_view(backend: Backend) -> None:
         gradients = backend.backward(frame, torch.ones_like(frame.colors), absgrad=True)
         for field in fields(Gradients):
             assert not bool(getattr(gradients, field.name).any()), field.name
+
+
+def test_a_frame_is_used_once(backend: Backend) -> None:
+    # A second backward would give the frame's buffers back twice, and two later frames would share them.
+    frame = draw(backend, single(make_case(1)))
+    backend.backward(frame, torch.ones_like(frame.colors))
+    with pytest.raises(UsageError):
+        backend.backward(frame, torch.ones_like(frame.colors))
 
 
 def images(height: int, width: int) -> tuple[Tensor, Tensor]:
