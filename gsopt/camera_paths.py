@@ -1,4 +1,4 @@
-"""Paths for films: orbit, ellipse and interpolation, from the cameras of a capture. Cameras in, Cameras out.
+"""Paths for films: orbit, turntable, ellipse and interpolation, from the cameras of a capture. Cameras in, Cameras out.
 
 All paths keep the image size; orbit and ellipse take the intrinsics of the first camera.
 """
@@ -22,6 +22,7 @@ ROLL_DAMPING = 1e-3
 """Pull of the up direction towards the mean of the cameras'; matters where they look the same way.
 
 It tilts a well-settled up by about 1e-4; less of it would let the roll of a shaky hand decide in a narrow capture."""
+LEAST_SWING = math.radians(15)
 ELLIPSE_QUANTILE = 0.9
 ELLIPSE_FLATTEST = 0.25
 """Least ratio of the two half axes: a row of cameras still gives a path around the subject."""
@@ -64,15 +65,21 @@ def orbit_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None = 
     `focus_point` when not given (with a single camera it should be given: one axis does not say how far to look).
     """
     check.at_least("count", count, 1, "Give the number of frames.")
-    up, focus = up_direction(cameras), _focus(cameras, focus)
-    offsets = cameras.centers.double() - focus
-    distances = offsets.norm(dim=1).clamp_min(1e-9)
-    elevation = float(torch.asin(((offsets @ up) / distances).clamp(-1, 1)).mean())
-    radius = float(distances.mean())
-    ahead, aside = _horizontal_axes(offsets[0], up)
-    angles = 2 * math.pi * torch.arange(count, dtype=torch.float64)[:, None] / count
-    ring = math.cos(elevation) * (angles.cos() * ahead + angles.sin() * aside) + math.sin(elevation) * up
-    return _looking(cameras, focus + radius * ring, focus, up)
+    return _on_circle(cameras, _turn(count), _focus(cameras, focus))
+
+
+def turntable_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None = None) -> Cameras:
+    """The orbit where the cameras stand all around; else a swing to and fro on the side they saw, at least 15 degrees.
+
+    All around: no gap of more than half a turn between their azimuths. What nobody photographed is not worth a film.
+    """
+    check.at_least("count", count, 1, "Give the number of frames.")
+    focus = _focus(cameras, focus)
+    first, width = _covered_arc(cameras, focus)
+    if width >= math.pi:
+        return _on_circle(cameras, _turn(count), focus)
+    swing = max(width / 2, LEAST_SWING) * _turn(count).sin()
+    return _on_circle(cameras, first + width / 2 + swing, focus)
 
 
 def ellipse_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None = None) -> Cameras:
@@ -116,6 +123,32 @@ def interpolated_path(cameras: Cameras, count: int) -> Cameras:
         viewmats=viewmats.to(cameras.viewmats),
         Ks=Ks[before].lerp(Ks[after], share[..., None]).to(cameras.Ks),
     )
+
+
+def _turn(count: int) -> Float[Tensor, " count"]:
+    """One turn in equal steps, radians; the end, which is the beginning, left out."""
+    return 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+
+
+def _on_circle(cameras: Cameras, azimuths: Float[Tensor, " N"], focus: Float[Tensor, "3"]) -> Cameras:
+    """Cameras at the mean distance and elevation, azimuths counted from the first camera."""
+    up, offsets = up_direction(cameras), cameras.centers.double() - focus
+    distances = offsets.norm(dim=1).clamp_min(1e-9)
+    elevation = float(torch.asin(((offsets @ up) / distances).clamp(-1, 1)).mean())
+    ahead, aside = _horizontal_axes(offsets[0], up)
+    level = azimuths.cos()[:, None] * ahead + azimuths.sin()[:, None] * aside
+    ring = math.cos(elevation) * level + math.sin(elevation) * up
+    return _looking(cameras, focus + distances.mean() * ring, focus, up)
+
+
+def _covered_arc(cameras: Cameras, focus: Float[Tensor, "3"]) -> tuple[float, float]:
+    """(start, width) of the shortest arc that holds every camera's azimuth, radians from the first camera."""
+    offsets = cameras.centers.double() - focus
+    ahead, aside = _horizontal_axes(offsets[0], up_direction(cameras))
+    azimuths = torch.atan2(offsets @ aside, offsets @ ahead).sort().values
+    gaps = torch.cat([azimuths[1:], azimuths[:1] + 2 * math.pi]) - azimuths
+    widest = int(gaps.argmax())
+    return float(azimuths[(widest + 1) % len(azimuths)]), 2 * math.pi - float(gaps[widest])
 
 
 def _need_one(cameras: Cameras) -> None:

@@ -113,7 +113,7 @@ def evaluate(
     kept = read_metrics(finished.path)  # before the work: a broken file is not to be replaced
     scene = scene or load_scene(finished.config.data)
     results = _results(finished, scene, vgg, on_view)
-    document = {**_about(finished), **kept, **results, "protocol": _protocol(finished, scene, results)}
+    document = {**kept, **_about(finished), **results, "protocol": _protocol(finished, scene, results)}
     write_atomic(finished.path / "metrics.json", to_json(document))
     return document
 
@@ -160,14 +160,14 @@ def _spread(views: Sequence[View], count: int) -> list[View]:
 
 
 def _about(finished: FinishedRun) -> dict[str, Any]:
-    """What the figures belong to; the run's own record, where there is one, has precedence."""
-    document = json.loads((finished.path / "config.json").read_bytes())
-    return {
+    """What the figures belong to."""
+    recorded = json.loads((finished.path / "config.json").read_bytes())
+    about = {
         "n_gaussians": len(finished.gaussians),
         "seed": finished.config.seed,
-        "versions": document.get("versions"),
         "config": finished.config.to_dict(),
     }
+    return {**about, **({"versions": recorded["versions"]} if "versions" in recorded else {})}
 
 
 def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt.camera_paths import ellipse_path, interpolated_path, orbit_path
+from gsopt.camera_paths import ellipse_path, interpolated_path, orbit_path, turntable_path
 from gsopt.cameras import Cameras
 from gsopt.config import TrainConfig
 from gsopt.data.resample import premultiply
@@ -109,10 +109,10 @@ def shots_along(run: FinishedRun, path: str, count: int, longest: int | None = N
 
 
 def film_path(run: FinishedRun, cameras: Cameras, path: str, count: int) -> Cameras:
-    """`count` cameras on an orbit, an ellipse or through the given cameras."""
+    """`count` cameras on an orbit, a turntable, an ellipse or through the given cameras (interpolated)."""
     if path == "interpolated":
         return interpolated_path(cameras, count)
-    make = {"orbit": orbit_path, "ellipse": ellipse_path}[path]
+    make = {"orbit": orbit_path, "turntable": turntable_path, "ellipse": ellipse_path}[path]
     return make(cameras, count, subject(run.gaussians, cameras))
 
 

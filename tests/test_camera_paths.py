@@ -8,7 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsopt.camera_paths import ellipse_path, focus_point, interpolated_path, orbit_path, up_direction
+from gsopt.camera_paths import (
+    ellipse_path,
+    focus_point,
+    interpolated_path,
+    orbit_path,
+    turntable_path,
+    up_direction,
+)
 from gsopt.cameras import Cameras, intrinsics, look_at
 from gsopt.errors import InputError
 
@@ -70,7 +77,7 @@ def test_up_is_the_worlds_even_from_one_side(ring: Cameras, one_sided: Cameras) 
     assert up_direction(one_sided) @ UP > 0.999
 
 
-@pytest.mark.parametrize("path", [orbit_path, ellipse_path])
+@pytest.mark.parametrize("path", [orbit_path, turntable_path, ellipse_path])
 def test_a_path_looks_at_its_focus_upright_from_a_constant_height(path, ring: Cameras) -> None:
     film = path(ring, 12, TARGET)
     assert (len(film), film.width, film.height) == (12, 32, 24)
@@ -88,6 +95,26 @@ def test_an_orbit_of_cameras_on_a_circle_is_that_circle_from_the_first_camera_on
     torch.testing.assert_close(distance, torch.full_like(distance, math.hypot(3, 2)), atol=1e-6, rtol=0)
     step = (film.centers - film.centers.roll(1, 0)).norm(dim=1)
     torch.testing.assert_close(step, step[:1].expand(10), atol=1e-6, rtol=0)
+
+
+def test_a_turntable_goes_all_around_only_where_the_cameras_stood_all_around(ring: Cameras) -> None:
+    torch.testing.assert_close(turntable_path(ring, 9, TARGET).viewmats, orbit_path(ring, 9, TARGET).viewmats)
+
+
+@pytest.mark.parametrize("azimuths", [[0.0, 0.3, 0.6], [2.9, 3.6, 3.0], [0.1, 2 * math.pi - 0.5]])
+def test_a_turntable_swings_between_the_outermost_cameras_of_one_side(azimuths: list[float]) -> None:
+    """Also across the place where azimuths jump from a turn to zero."""
+    eyes = on_ring(torch.tensor(azimuths, dtype=torch.float64), 3.0, 2.0)
+    film = turntable_path(cameras_at(eyes), 16, TARGET)
+    reached = torch.cdist(eyes, film.centers).min(dim=1).values
+    outermost = torch.cdist(eyes, eyes).max(dim=1).values.topk(2).indices
+    assert reached[outermost].max() < 0.01
+    assert torch.cdist(film.centers, film.centers).max() < torch.cdist(eyes, eyes).max() + 0.01
+
+
+def test_a_turntable_of_one_camera_still_moves(ring: Cameras) -> None:
+    film = turntable_path(ring[0], 8, TARGET)
+    assert 0.5 < torch.cdist(film.centers, film.centers).max() < 3
 
 
 def test_an_ellipse_follows_a_longish_capture_in_equal_steps() -> None:
@@ -122,7 +149,7 @@ def test_an_interpolated_path_of_one_camera_stays_there(ring: Cameras) -> None:
     torch.testing.assert_close(film.viewmats, ring.viewmats[:1].expand(3, 4, 4), atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("path", [orbit_path, ellipse_path, interpolated_path])
+@pytest.mark.parametrize("path", [orbit_path, turntable_path, ellipse_path, interpolated_path])
 def test_a_path_moves_with_the_world(path, ring: Cameras) -> None:
     """Similar worlds have similar films: rotation, translation and scale go straight through."""
     axis = torch.tensor([[0, -0.3, 0.2], [0.3, 0, -0.9], [-0.2, 0.9, 0]], dtype=torch.float64)
@@ -132,6 +159,6 @@ def test_a_path_moves_with_the_world(path, ring: Cameras) -> None:
 
 
 def test_no_cameras_make_no_path(ring: Cameras) -> None:
-    for path in (orbit_path, ellipse_path, interpolated_path):
+    for path in (orbit_path, turntable_path, ellipse_path, interpolated_path):
         with pytest.raises(InputError, match="got 0"):
             path(ring[:0], 3)

@@ -31,7 +31,7 @@ def test_drawing_the_held_out_views_gives_back_the_truth(run: Path, tmp_path: Pa
         assert np.array_equal(np.asarray(Image.open(path)), np.asarray(truth))
 
 
-@pytest.mark.parametrize("path", ["orbit", "ellipse", "interpolated"])
+@pytest.mark.parametrize("path", ["orbit", "turntable", "ellipse", "interpolated"])
 def test_a_film_path_has_the_frames_asked_for_and_the_subject_in_the_middle(run: Path, path: str) -> None:
     finished = open_run(run)
     shots = shots_along(finished, path, 5, longest=20)

@@ -18,12 +18,13 @@ class Flags:
 
     run: tyro.conf.Positional[Path]
     """The run directory that `gsopt train` wrote."""
-    path: Literal["train", "test", "orbit", "ellipse", "interpolated"] = "orbit"
-    """train and test: those views; orbit and ellipse: around the subject; interpolated: through the input views."""
+    path: Literal["train", "test", "orbit", "turntable", "ellipse", "interpolated"] = "turntable"
+    """train and test: those views; orbit and ellipse: around the subject; turntable: the orbit, or a swing where the
+    cameras stood on one side only; interpolated: through the input views in their order."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A folder for PNG frames, or a film that ends in .mp4, .webp or .gif. RUN/renders/PATH when not given."""
     frames: int = 120
-    """Frames on orbit, ellipse and interpolated."""
+    """Frames on the other paths."""
     fps: float = 24.0
     """Frames per second of a film."""
     size: int | None = None

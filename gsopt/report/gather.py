@@ -190,11 +190,11 @@ def _take_drawings(report: Report, finished: FinishedRun, scene: Scene) -> None:
     rows = [row for row in report.per_view if row["name"] in views and row["psnr"] is not None]
     order = chosen([row["psnr"] for row in rows])
     for place, index in enumerate(order):
-        badge = "worst" if place == 0 else "best" if place == len(order) - 1 else ""
+        badge = {0: "worst", len(order) - 1: "best"}.get(place, "") if len(order) > 1 else ""
         report.judged.append(_judged(finished, views[rows[index]["name"]], rows[index], badge))
     size = scene.train[0].camera
     cameras = Cameras.cat([view.camera.resized(size.width, size.height) for view in scene.train])
-    film = film_path(finished, cameras, "orbit", TURNTABLE_FRAMES)
+    film = film_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
     side = min(TURNTABLE_SIDE, 2 * max(size.width, size.height))
     report.turntable = [as_image(finished.draw(fitted(film[i], side))) for i in range(len(film))]
 

@@ -104,10 +104,12 @@ def views(report: Report) -> str:
         return ""
     kind = "Held-out views" if report.held_out else "Training views (not held out)"
     worst, best = report.judged[0], report.judged[-1]
+    shown, judged = len(report.judged), len(report.per_view)
+    count = f"All {judged} are" if shown == judged else f"{shown} of {judged} are"
     lead = (
         f"Worst: <b>{escape(worst.name)}</b> ({figure('psnr', worst.figures['psnr'])} dB). "
         f"Best: <b>{escape(best.name)}</b> ({figure('psnr', best.figures['psnr'])} dB). "
-        f"{len(report.judged)} of {len(report.per_view)} are shown, by rising PSNR."
+        f"{count} shown, by rising PSNR."
     )
     legend = (
         f'<p class="legend"><span>Error 0</span><i style="background:{error_gradient()}"></i>'
