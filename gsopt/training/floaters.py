@@ -10,7 +10,7 @@ from torch import Tensor
 
 # Neighbours are looked for among at most this many Gaussians: the estimate of the local density stays, the cost does
 # not grow with the square of N. The rows are in Morton order, so that an even stride is an even sample of space.
-MOST_REFERENCES = 2048
+MOST_REFERENCES = 1024
 FEWEST = 64
 """Below this many Gaussians the statistics mean nothing and none is called a floater."""
 LEAST_SPREAD = 0.01
@@ -28,7 +28,7 @@ def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:
 
 
 def neighbor_distances(means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Mean distance, scene units, to the nearest √N neighbours, or to the same share of at most 2048 references."""
+    """Mean distance, scene units, to the nearest √N neighbours, or to the same share of at most 1024 references."""
     count = len(means)
     stride = -(-count // MOST_REFERENCES)
     references = means[::stride]

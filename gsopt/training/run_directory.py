@@ -21,7 +21,7 @@ Listener = Callable[[Mapping[str, Any]], None]
 # What a run leaves behind that must not be lost. A folder with config.json, events and a log alone holds no work.
 WORK = ("splat.ply", "metrics.json", "report.html", "previews/*", "checkpoints/*.safetensors")
 # Settings that may differ when a run is resumed: they do not change a bit of the result.
-FREE = ("threads", "checkpoint_every", "preview_every")
+FREE = ("threads", "checkpoint_every", "preview_every", "data.cache_mb")
 # How whole-or-nothing writers name a file before it is whole: a dot, its name, the process.
 TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
 PACKAGES = ("torch", "numpy", "pillow", "safetensors")

@@ -111,11 +111,16 @@ class Trainer:
         v_alphas = None
         if self._weights.alpha > 0 and target.alphas is not None:
             v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha)
-        absgrad = self.config.density.absgrad and self.config.density.strategy == "adc"
-        gradients = self.backend.backward(frame, photometric.v_colors, v_alphas, absgrad=absgrad)
+        gradients = self.backend.backward(frame, photometric.v_colors, v_alphas, absgrad=self._wants_absgrad())
         self._density.after_backward(self.step, gradients, frame.radii, target.camera.width, target.camera.height)
         self._show(photometric.loss, frame.colors, target.colors)
         return photometric.loss, self._regularized(gradients, dropout)
+
+    def _wants_absgrad(self) -> bool:
+        """Whether adc will read absolute gradients of this step."""
+        density = self.config.density
+        wanted = density.absgrad and density.strategy == "adc"
+        return wanted and self.step <= schedule.refine_stop(density, self.config.iterations)
 
     def _dropout(self) -> Dropout | None:
         """With few views a step draws a random part of the Gaussians."""

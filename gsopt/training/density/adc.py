@@ -56,7 +56,7 @@ class Adc:
     def refine(self, step: int, model: Model) -> Model:
         """Grow, prune and start the statistics afresh; lower all opacities when a reset is due."""
         if schedule.refines(step, self._config, self._iterations):
-            model = self._prune(step, self._grow(model))
+            model = self._grow_and_prune(step, model)
             self._forget(len(model))
         if schedule.resets(step, self._config, self._iterations):
             lower_opacities(model, 2 * self._config.prune_opacity)
@@ -71,23 +71,25 @@ class Adc:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         self.grad_sum, self.seen = tensors["grad_sum"], tensors["seen"]
 
-    def _grow(self, model: Model) -> Model:
-        """Clone small Gaussians and split large ones where the mean gradient is above the threshold."""
+    def _grow_and_prune(self, step: int, model: Model) -> Model:
+        """Clone small Gaussians and split large ones where the mean gradient is above the threshold; prune both."""
+        gaussians = model.gaussians
         scores = self.grad_sum / self.seen.clamp_min(1)
         room = max(0, self._config.max_gaussians - len(model))
         growing = best(scores > self._config.grow_grad2d, scores, room)
-        large = largest_scales(model.gaussians) > self._config.grow_scale3d * self._extent
-        clones = model.gaussians.select(growing & ~large)
-        halves = split(model.gaussians.select(growing & large), self._generator)
-        return model.select(~(growing & large)).append(clones).append(halves)
+        splitting = growing & (largest_scales(gaussians) > self._config.grow_scale3d * self._extent)
+        keep = at_least_one(self._keep(step, gaussians), gaussians.logit_opacities)
+        halves = split(gaussians.select(splitting), self._generator)
+        halves = halves.select(self._keep(step, halves))
+        clones = gaussians.select(growing & ~splitting & keep)
+        return model.select(keep & ~splitting).append(clones.append(halves))
 
-    def _prune(self, step: int, model: Model) -> Model:
-        """Remove the transparent and, once opacities were reset, the huge."""
-        opacities = model.gaussians.opacities
-        keep = opacities >= self._config.prune_opacity
+    def _keep(self, step: int, gaussians: Gaussians) -> Bool[Tensor, "N"]:
+        """Neither transparent nor, once opacities were reset, huge."""
+        keep = gaussians.opacities >= self._config.prune_opacity
         if 0 < self._config.reset_every < step:
-            keep &= largest_scales(model.gaussians) <= self._config.prune_scale3d * self._extent
-        return model.select(at_least_one(keep, opacities))
+            keep &= largest_scales(gaussians) <= self._config.prune_scale3d * self._extent
+        return keep
 
 
 def best(chosen: Bool[Tensor, "N"], scores: Float[Tensor, "N"], room: int) -> Bool[Tensor, "N"]:
