@@ -19,11 +19,19 @@ from gsopt.raster.backend import Frame, Gradients, Photometric, RasterSettings
 ISA_VARIABLE = "GSOPT_ISA"
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Context:
     frame: Any
+    """None once its buffers were given back."""
     model: Any
     gaussians: Gaussians
+
+    def take(self) -> Any:
+        """The frame, once: a second use would read buffers that belong to another camera by now."""
+        if self.frame is None:
+            raise UsageError("This frame was used before. Call `forward` again: a frame serves one `backward`.")
+        frame, self.frame = self.frame, None
+        return frame
 
 
 class CpuBackend:
@@ -92,19 +100,20 @@ class CpuBackend:
         """See `Backend.backward`. The frame's buffers are used again by a later `forward`."""
         context = frame.context
         assert isinstance(context, _Context)
+        buffers = context.take()
         n = len(context.gaussians)
         gradients = {name: torch.empty_like(tensor) for name, tensor in context.gaussians.items()}
         means2d, means2d_abs = torch.empty(n, 2), torch.empty(n, 2) if absgrad else None
         out = _cpu.Gradient(*gradients.values(), means2d, means2d_abs)
         alphas, depths = _contiguous(v_alphas), _contiguous(v_depths)
-        _cpu.backward(self._workspace, context.frame, context.model, v_colors.contiguous(), alphas, depths, out)
-        self._idle.append(context.frame)
+        _cpu.backward(self._workspace, buffers, context.model, _contiguous(v_colors), alphas, depths, out)
+        self._idle.append(buffers)
         return Gradients(**gradients, means2d=means2d, means2d_abs=means2d_abs)
 
     def release(self, frame: Frame) -> None:
         """Give a frame's buffers back when no `backward` will follow."""
         assert isinstance(frame.context, _Context)
-        self._idle.append(frame.context.frame)
+        self._idle.append(frame.context.take())
 
     def photometric(
         self, rendered: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], lambda_dssim: float
@@ -142,7 +151,7 @@ def _as_float32(gaussians: Gaussians) -> Gaussians:
 
 
 def _contiguous(tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.float().contiguous()
+    return None if tensor is None else tensor.detach().float().contiguous()
 
 
 def _available_cores() -> int:

@@ -115,9 +115,9 @@ template <class F> inline Splat3D<F> project_backward(const Camera& cam, const P
   const F idet = splat<F>(1.f) / p.det;
   const F a = p.yy * idet, b = splat<F>(0.f) - p.xy * idet, c = p.xx * idet;
   // cov2d: -Q G Q with Q the conic, G its gradient; xy counts both off-diagonal entries.
-  F xx = splat<F>(0.f) - (a * a * v.a + a * b * v.b + b * b * v.c);
-  F yy = splat<F>(0.f) - (b * b * v.a + b * c * v.b + c * c * v.c);
-  F xy = splat<F>(0.f) - (a * b * v.a * 2.f + (a * c + b * b) * v.b + b * c * v.c * 2.f);
+  const F h_det = (v.a * a + v.b * b + v.c * c) * idet;  // through the determinant
+  F xx = v.c * idet - h_det * p.yy, yy = v.a * idet - h_det * p.xx;
+  F xy = h_det * p.xy * 2.f - v.b * idet;
   if (cam.antialiased) {  // log opacity holds (log det0 - log det) / 2
     const F h = v.log_opacity * 0.5f, h0 = h / max(p.det0, splat<F>(1e-30f));
     xx = xx + h0 * (p.yy - cam.eps2d) - h * a;
