@@ -163,8 +163,9 @@ def read_compressed(file: BinaryIO, header: Header, file_size: int, path: Path) 
     extremes[:, len(_WITHOUT_COLOR) :] = [0, 0, 0, 1, 1, 1]
     seek_element(file, header, chunk, file_size, path)
     names = [name for name in _EXTREMES if name in chunk.names]
-    for rows, block in _placed(float_blocks(file, header, chunk, path)):
-        extremes[rows, : len(names)] = block[:, [chunk.names.index(name) for name in names]]
+    with np.errstate(invalid="ignore"):  # a NaN is named and refused with the splats that it makes
+        for rows, block in _placed(float_blocks(file, header, chunk, path)):
+            extremes[rows, : len(names)] = block[:, [chunk.names.index(name) for name in names]]
     file.seek(header.size)
     seek_element(file, header, vertex, file_size, path)
     packed = np.empty((vertex.count, 4), np.uint32)

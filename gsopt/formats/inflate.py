@@ -65,8 +65,12 @@ class GzipStream:
 
 
 def deflated(parts: Iterable[bytes]) -> Iterator[bytes]:
-    """The parts as one gzip stream, without a time stamp: same splats, same bytes."""
-    packer = zlib.compressobj(6, zlib.DEFLATED, _GZIP_WINDOW)
+    """The parts as one gzip stream, without a time stamp: same splats, same bytes.
+
+    Run lengths and Huffman codes only: quantised splats hold few longer repeats, so looking for them costs ten times
+    the time and makes the stream larger.
+    """
+    packer = zlib.compressobj(6, zlib.DEFLATED, _GZIP_WINDOW, 9, zlib.Z_RLE)
     for part in parts:
         yield packer.compress(part)
     yield packer.flush()
