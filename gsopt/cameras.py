@@ -17,7 +17,7 @@ OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch
 
 
 def viewmats_from_opengl(world_from_cam: Float[Tensor, "*C 4 4"]) -> Float[Tensor, "*C 4 4"]:
-    """Camera-to-world matrices in OpenGL axes (NeRF-synthetic, nerfstudio, Blender) to cam_from_world in OpenCV axes."""
+    """Camera-to-world in OpenGL axes (NeRF-synthetic, nerfstudio, Blender) to cam_from_world in OpenCV axes."""
     flip = OPENCV_FROM_OPENGL.to(world_from_cam)
     return torch.linalg.inv(world_from_cam @ flip)
 
@@ -62,8 +62,8 @@ class Cameras:
         scale = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.Ks)
         return replace(self, Ks=self.Ks * scale[:, None], width=width, height=height)
 
-    def to(self, *args: torch.dtype | torch.device | str) -> Cameras:
-        return replace(self, viewmats=self.viewmats.to(*args), Ks=self.Ks.to(*args))
+    def to(self, target: torch.dtype | torch.device | str) -> Cameras:
+        return replace(self, viewmats=self.viewmats.to(target), Ks=self.Ks.to(target))
 
     def validate(self) -> Cameras:
         """Return self if shapes agree, values are finite and focal lengths positive; else InputError or UsageError."""
@@ -92,9 +92,7 @@ def intrinsics(fov_x: float, width: int, height: int) -> Float[Tensor, "3 3"]:
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
 
 
-def look_at(
-    eyes: Float[Tensor, "C 3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
-) -> Float[Tensor, "C 4 4"]:
+def look_at(eyes: Float[Tensor, "C 3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "C 4 4"]:
     """viewmats of cameras at `eyes` that look at `target`; where `up` is parallel to the view, another up is taken."""
     z = torch.nn.functional.normalize(target - eyes, dim=-1)
     x = torch.linalg.cross(z, up.expand_as(z))

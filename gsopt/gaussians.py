@@ -69,9 +69,9 @@ class Gaussians:
         """These rows, then the other's."""
         return Gaussians(**{name: torch.cat([tensor, getattr(other, name)]) for name, tensor in self.items()})
 
-    def to(self, *args: torch.dtype | torch.device | str) -> Gaussians:
+    def to(self, target: torch.dtype | torch.device | str) -> Gaussians:
         """Same record with every tensor moved or cast by `Tensor.to`."""
-        return Gaussians(**{name: tensor.to(*args) for name, tensor in self.items()})
+        return Gaussians(**{name: tensor.to(target) for name, tensor in self.items()})
 
     def with_sh_degree(self, degree: int) -> Gaussians:
         """Pad with zero bands or drop bands so that exactly `degree` is stored."""
@@ -82,7 +82,7 @@ class Gaussians:
         return replace(self, shN=shN.contiguous())
 
     def validate(self) -> Gaussians:
-        """Return self if shapes agree, values are finite and no quaternion is zero; else InputError names what and where."""
+        """Return self if shapes agree, values are finite and no quaternion is zero; InputError says what and where."""
         n = len(self)
         expected = {
             "means": (n, 3),

@@ -10,8 +10,8 @@ The image model, which the float64 reference defines and every backend follows:
 * cov2d = J W Σ Wᵀ Jᵀ + eps2d·I with J the Jacobian of the pinhole projection at t, its t_x/t_z and t_y/t_z clamped to
   the view widened by 30 % of tan(fov/2) on either side (Zwicker 2001; Kerbl et al. 2023).
 * opacity o = sigmoid(logit), times sqrt(max(0, det cov / det cov2d)) when antialiased (Yu et al. 2024).
-* alpha(p) = min(0.99, o · exp(-½ (p-mean2d)ᵀ cov2d⁻¹ (p-mean2d))), p the pixel centre; below 1/255 it contributes nothing.
-  Where alpha is clamped to 0.99 the gradient with respect to o and the exponent is zero, as the derivative says.
+* alpha(p) = min(0.99, o · exp(-½ (p-mean2d)ᵀ cov2d⁻¹ (p-mean2d))), p the pixel centre; below 1/255 it contributes
+  nothing. Where alpha is clamped to 0.99 the gradient with respect to o and the exponent is zero: the true derivative.
 * front to back by depth t_z, ties by index; a pixel takes no more once its transmittance T <= 1e-4.
 * colour = Σ T alpha c + T_final · background; alpha = 1 - T_final; depth = Σ T alpha t_z (not normalised).
 * c = max(0, 0.5 + Σ sh_k Y_k(d)), d the unit vector from the camera centre to the mean.

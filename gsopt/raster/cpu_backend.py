@@ -35,8 +35,8 @@ class _Context:
 
 
 class CpuBackend:
-    """`threads` = 0 takes one per core. The environment variable GSOPT_ISA (avx512, avx2, portable) overrides the choice of
-    instruction set; one that this processor lacks raises UsageError."""
+    """`threads` = 0 takes one per core. The environment variable GSOPT_ISA (avx512, avx2, portable) overrides the
+    choice of instruction set; one that this processor lacks raises UsageError."""
 
     name = "cpu"
 
@@ -141,9 +141,7 @@ class CpuBackend:
     ) -> None:
         """See `Backend.adam`."""
         active = param[0].numel() if len(param) else 0
-        _cpu.adam(
-            self._workspace, param, grad, exp_avg, exp_avg_sq, len(param), active, lr, beta1, beta2, eps, step
-        )
+        _cpu.adam(self._workspace, param, grad, exp_avg, exp_avg_sq, len(param), active, lr, beta1, beta2, eps, step)
 
 
 def _as_float32(gaussians: Gaussians) -> Gaussians:
