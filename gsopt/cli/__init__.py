@@ -26,16 +26,10 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code: 0, a GsoptError's `exit_code`, or 130 when interrupted."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    first = arguments[0] if arguments else ""
-    if first in ("-h", "--help"):
-        print(usage())
-        return 0
-    if first == "--version":
-        print(f"gsopt {__version__}")
-        return 0
     try:
-        return run_verb(first, arguments[1:])
+        code = answer(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()  # here, where a closed pipe can be caught
+        return code
     except GsoptError as error:
         print(f"gsopt: {error}", file=sys.stderr)
         return error.exit_code
@@ -45,6 +39,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `gsopt ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def answer(arguments: Sequence[str]) -> int:
+    """Print help or the version, or run the verb that comes first."""
+    first = arguments[0] if arguments else ""
+    if first in ("-h", "--help"):
+        print(usage())
+        return 0
+    if first == "--version":
+        print(f"gsopt {__version__}")
+        return 0
+    return run_verb(first, arguments[1:])
 
 
 def run_verb(verb: str, arguments: Sequence[str]) -> int:
