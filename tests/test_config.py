@@ -7,14 +7,15 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt import config as settings
+from gsopt import config as configuration
 from gsopt.config import DataConfig, DensityConfig, OptimizerConfig, ScheduleConfig, TrainConfig
 from gsopt.errors import InputError, UsageError
 
 
+@settings(max_examples=50, deadline=None)
 @given(
     views=st.none() | st.integers(1, 10**6),
     steps=st.lists(st.integers(1, 10**6), unique=True, max_size=4).map(sorted),
@@ -86,12 +87,12 @@ def test_a_wrong_key_or_type_is_named(document, named: str) -> None:
         (DensityConfig, "refine_every", 0),
         (DensityConfig, "growth", 0.9),
         (DensityConfig, "prune_opacity", 0.0),
-        (settings.LossConfig, "lambda_dssim", 1.1),
-        (settings.SparseConfig, "dropout", 1.0),
+        (configuration.LossConfig, "lambda_dssim", 1.1),
+        (configuration.SparseConfig, "dropout", 1.0),
         (ScheduleConfig, "coarse_until", (500, 500)),
         (ScheduleConfig, "coarse_until", (0, 500)),
-        (settings.InitConfig, "count", 0),
-        (settings.InitConfig, "method", "magic"),
+        (configuration.InitConfig, "count", 0),
+        (configuration.InitConfig, "method", "magic"),
     ],
 )
 def test_a_value_out_of_range_is_a_usage_error_that_tells_what_to_do(cls, name: str, value) -> None:
@@ -106,8 +107,8 @@ def test_views_and_view_ids_exclude_each_other() -> None:
 
 def test_every_setting_says_what_it_means() -> None:
     """The command line shows these texts; a field without one would be a flag without help."""
-    source = Path(settings.__file__).read_text(encoding="utf-8").splitlines()
-    for cls in vars(settings).values():
+    source = Path(configuration.__file__).read_text(encoding="utf-8").splitlines()
+    for cls in vars(configuration).values():
         if not dataclasses.is_dataclass(cls) or cls is TrainConfig:
             continue
         for field in dataclasses.fields(cls):

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError, UsageError
@@ -22,6 +22,7 @@ FIELDS = st.dictionaries(
 )
 
 
+@settings(max_examples=50, deadline=None)
 @given(events=st.lists(FIELDS, max_size=5), cut=st.integers(0, 400))
 def test_a_reader_that_tails_sees_every_event_once_and_in_order(tmp_path_factory, events: list[dict], cut: int) -> None:
     run = tmp_path_factory.mktemp("run")

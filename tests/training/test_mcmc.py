@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scenes import cloud
 
@@ -32,6 +32,7 @@ def paper_factor(opacity: float, n: int) -> float:
     return opacity / total
 
 
+@settings(max_examples=50, deadline=None)
 @given(opacity=st.floats(0.005, 0.999), n=st.integers(1, 51))
 def test_shared_is_equation_nine(opacity: float, n: int) -> None:
     new, factor = shared(torch.tensor([opacity], dtype=torch.float64), torch.tensor([n]))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.training.morton import BITS, morton_order
 from gsopt.training.order import ViewOrder, generators
 
 
+@settings(max_examples=50, deadline=None)
 @given(views=st.integers(1, 20), seed=st.integers(0, 1000))
 def test_every_epoch_sees_every_view_once(views: int, seed: int) -> None:
     order = ViewOrder(views, generators(seed)["views"])

@@ -6,7 +6,7 @@ import itertools
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.config import DensityConfig, LossConfig, OptimizerConfig, SparseConfig, TrainConfig
@@ -28,6 +28,7 @@ def test_a_rate_of_zero_stays_zero() -> None:
     assert schedule.lr_means(3, 10, OptimizerConfig(lr_means=0.0), 1.0) == 0.0
 
 
+@settings(max_examples=50, deadline=None)
 @given(step=st.integers(1, 10_000), every=st.integers(1, 3000), highest=st.integers(0, 3))
 def test_bands_come_one_by_one_and_never_pass_the_highest(step: int, every: int, highest: int) -> None:
     config = OptimizerConfig(sh_degree_every=every)
@@ -58,6 +59,7 @@ def test_a_given_end_of_refinement_is_kept() -> None:
     assert schedule.refine_stop(DensityConfig(refine_stop=123), 30_000) == 123
 
 
+@settings(max_examples=50, deadline=None)
 @given(iterations=st.integers(1, 40_000), every=st.integers(0, 5000))
 def test_no_reset_scars_the_end_of_a_run(iterations: int, every: int) -> None:
     config = DensityConfig(reset_every=every)
