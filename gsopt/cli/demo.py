@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     code = train.main([str(SCENE), "-m", str(run), "--iterations", str(flags.iterations)])
     report = run / "report.html"
     if code == 0 and report.is_file():
-        print(f"Open {report.resolve()} in a browser; `gsopt view {run}` shows the splats.")
+        print(f"Open {report.resolve()} in a browser.")
     return code
 
 
