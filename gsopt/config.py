@@ -76,17 +76,17 @@ class OptimizerConfig:
 
     lr_means: float = 1.6e-4
     """Times the scene extent; decays log-linearly to `lr_means_final` over the run."""
-    lr_means_final: float = 1.6e-6
+    lr_means_final: float = 1.6e-5
     """Times the scene extent; reached at the last step."""
     lr_quats: float = 1e-3
     """Of the rotations."""
-    lr_log_scales: float = 5e-3
+    lr_log_scales: float = 1.5e-2
     """Of the logarithms of the scales."""
     lr_logit_opacities: float = 5e-2
     """Of the opacities before the sigmoid."""
-    lr_sh0: float = 2.5e-3
+    lr_sh0: float = 5e-3
     """Of the base colour."""
-    lr_shN: float = 1.25e-4
+    lr_shN: float = 2.5e-4
     """Of the view-dependent colour."""
     beta1: float = 0.9
     """Decay of Adam's mean gradient."""
@@ -136,8 +136,8 @@ class DensityConfig:
 
     strategy: Literal["adc", "mcmc"] = "adc"
     """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
-    max_gaussians: int = 1_000_000
-    """Never more than this."""
+    max_gaussians: int | None = None
+    """Never more than this; when not given, what the images show and the length of the run call for."""
     refine_start: int = 500
     """First step after which Gaussians are added and removed."""
     refine_stop: int | None = None
@@ -163,7 +163,8 @@ class DensityConfig:
 
     def __post_init__(self) -> None:
         check.one_of("--strategy", self.strategy, ("adc", "mcmc"))
-        check.within("--max-gaussians", self.max_gaussians, 1, MOST_GAUSSIANS, "The default is 1000000.")
+        if self.max_gaussians is not None:
+            check.within("--max-gaussians", self.max_gaussians, 1, MOST_GAUSSIANS, "Drop the flag for the default.")
         check.at_least("--density.refine-start", self.refine_start, 0, "The default is 500.")
         check.at_least("--density.refine-stop", self.refine_stop or 0, 0, "Drop the flag for the default.")
         check.at_least("--density.refine-every", self.refine_every, 1, "The default is 100.")
@@ -182,26 +183,26 @@ class SparseConfig:
 
     below_views: int = 16
     """Number of input views from which on down they are active; 0 turns them off."""
-    dropout: float = 0.2
+    dropout: float = 0.4
     """Share of Gaussians left out of the last step, rising linearly from 0 (DropGaussian, Park et al. 2025)."""
     floater_every: int = 500
     """Steps between two prunings by nearest-neighbour distance (GaussianObject, Yang et al. 2024); 0 = never."""
-    lambda_opacity: float = 0.01
+    lambda_opacity: float = 0.03
     """Replaces the weight of LossConfig where this is larger."""
     lambda_scale: float = 0.01
     """Replaces the weight of LossConfig where this is larger."""
-    lambda_alpha: float = 0.1
+    lambda_alpha: float = 0.5
     """Replaces the weight of LossConfig where this is larger."""
     sh_degree: int = 2
     """Upper bound on the bands."""
 
     def __post_init__(self) -> None:
         check.at_least("--sparse.below-views", self.below_views, 0, "0 turns these regularisers off.")
-        check.within("--sparse.dropout", self.dropout, 0.0, 0.95, "0 leaves none out; the default is 0.2.")
+        check.within("--sparse.dropout", self.dropout, 0.0, 0.95, "0 leaves none out; the default is 0.4.")
         check.at_least("--sparse.floater-every", self.floater_every, 0, "0 never prunes; the default is 500.")
-        check.within("--sparse.lambda-opacity", self.lambda_opacity, 0.0, MOST, "The default is 0.01.")
+        check.within("--sparse.lambda-opacity", self.lambda_opacity, 0.0, MOST, "The default is 0.03.")
         check.within("--sparse.lambda-scale", self.lambda_scale, 0.0, MOST, "The default is 0.01.")
-        check.within("--sparse.lambda-alpha", self.lambda_alpha, 0.0, MOST, "The default is 0.1.")
+        check.within("--sparse.lambda-alpha", self.lambda_alpha, 0.0, MOST, "The default is 0.5.")
         check.within("--sparse.sh-degree", self.sh_degree, 0, 3, "Bands 0 to 3 are supported.")
 
 
@@ -209,18 +210,20 @@ class SparseConfig:
 class ScheduleConfig:
     """Skip what a step does not need."""
 
-    coarse_until: tuple[int, ...] = ()
-    """Steps at which the resolution doubles, e.g. 500 1500: quarter, half, full."""
+    coarse_until: tuple[int, ...] | None = None
+    """Steps at which the resolution doubles, e.g. 500 1500: quarter, half, full. When not given, shares of the run
+    (training/schedule.py); the flag without a step means full resolution throughout."""
     stop_when_flat: bool = False
     """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
 
     def __post_init__(self) -> None:
-        steps = (0, *self.coarse_until)
+        given = self.coarse_until or ()
+        steps = (0, *given)
         if any(later <= earlier for earlier, later in itertools.pairwise(steps)):
             raise UsageError(
-                f"`--schedule.coarse-until` must be rising steps above 0, got {list(self.coarse_until)}. Try 500 1500."
+                f"`--schedule.coarse-until` must be rising steps above 0, got {list(given)}. Try 500 1500."
             )
-        check.within("number of --schedule.coarse-until", len(self.coarse_until), 0, 6, "Each one halves the image.")
+        check.within("number of --schedule.coarse-until", len(given), 0, 6, "Each one halves the image.")
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ class Density(settings.DensityConfig):
 
     strategy: Annotated[Literal["adc", "mcmc"], arg(prefix_name=False)] = "adc"
     """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
-    max_gaussians: Annotated[int, arg(prefix_name=False)] = 1_000_000
-    """Never more than this."""
+    max_gaussians: Annotated[int | None, arg(prefix_name=False, metavar="N")] = None
+    """Never more than this; when not given, about 1.4 per pixel that shows something, more in longer runs."""
 
 
 @dataclass(frozen=True)

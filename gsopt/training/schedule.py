@@ -5,12 +5,19 @@ Steps count from 1 to `iterations`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from gsopt.config import DensityConfig, OptimizerConfig, TrainConfig
+from gsopt.config import MOST_GAUSSIANS, DensityConfig, OptimizerConfig, TrainConfig
 
 # Published end of refinement (Kerbl et al. 2023; Kheradmand et al. 2024), and its share of a shorter run.
 REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}
+# Shares of a run drawn at a quarter and at half of the resolution. Early steps only move coarse shapes; with few views
+# a longer coarse phase keeps fine detail from being learned as view-dependent fog (docs/decisions/0001-schedule.md).
+COARSE, COARSE_SPARSE = (0.06, 0.23), (1 / 6, 1 / 2)
+# The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
+GAUSSIANS_PER_PIXEL = 1.44
+SMALLEST_BUDGET, LARGEST_BUDGET = 20_000, 1_000_000
 # A reset takes about this many steps to heal: none is made so late that the run would end with its scar.
 STEPS_AFTER_RESET = 2000
 # Floaters: distance to the neighbours beyond the mean, in standard deviations, at the first and at the last step.
@@ -62,6 +69,28 @@ def lr_means(step: int, iterations: int, config: OptimizerConfig, extent: float)
     if first <= 0 or last <= 0:
         return 0.0
     return extent * first * (last / first) ** (step / iterations)
+
+
+def coarse_until(config: TrainConfig, views: int) -> tuple[int, ...]:
+    """Last steps at a quarter and at half of the resolution, as given or as shares of the run."""
+    if config.schedule.coarse_until is not None:
+        return config.schedule.coarse_until
+    shares = COARSE_SPARSE if is_sparse(config, views) else COARSE
+    steps = (round(share * config.iterations) for share in shares)
+    return tuple(step for step in steps if step > 0)
+
+
+def max_gaussians(config: TrainConfig, pixels: float) -> int:
+    """The budget as given, or what `pixels`, those of an image that show something, can use in a run this long."""
+    if config.density.max_gaussians is not None:
+        return config.density.max_gaussians
+    wanted = round(GAUSSIANS_PER_PIXEL * pixels * math.sqrt(config.iterations / 7000))
+    return min(max(wanted, SMALLEST_BUDGET), LARGEST_BUDGET)
+
+
+def budget(config: DensityConfig) -> int:
+    """The resolved limit on the number of Gaussians."""
+    return MOST_GAUSSIANS if config.max_gaussians is None else config.max_gaussians
 
 
 def downscale(step: int, coarse_until: tuple[int, ...]) -> int:

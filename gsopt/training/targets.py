@@ -27,6 +27,17 @@ class Target:
     """None where the image has no alpha and no mask."""
 
 
+def content_pixels(views: Sequence[View], most: int = 16) -> float:
+    """How many pixels of an image show something, alpha counted as a share: the mean over up to `most` spread views."""
+    chosen = views[:: max(1, len(views) // most)][:most]
+    return sum(_content(view.pixels()) for view in chosen) / len(chosen)
+
+
+def _content(pixels: UInt8[Tensor, "H W C"]) -> float:
+    opaque = pixels.shape[2] < 4
+    return float(pixels.shape[0] * pixels.shape[1]) if opaque else int(pixels[..., 3].sum(dtype=torch.int64)) / 255
+
+
 class Targets:
     """Float targets of all input views. Keeps as many as fit into `budget` bytes, in the order they are asked for.
 

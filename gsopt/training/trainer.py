@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -23,7 +23,7 @@ from gsopt.training.morton import morton_order
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 from gsopt.training.order import ViewOrder, generators
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
-from gsopt.training.targets import BACKGROUNDS, Target, Targets
+from gsopt.training.targets import BACKGROUNDS, Target, Targets, content_pixels
 
 # The PSNR that is shown is taken every so many steps: the mean squared error costs a pass over the image.
 PSNR_EVERY = 10
@@ -69,16 +69,18 @@ class Trainer:
         self._background = None if fixed is None else torch.tensor(fixed)
         self._targets = Targets(scene.train, self._background, int(TARGET_SHARE * config.data.cache_mb * 1e6))
         self._extent = scene.extent
+        self._coarse_until = schedule.coarse_until(config, views)
+        self._budget = schedule.max_gaussians(config, content_pixels(scene.train))
         self.model = Model.start(self._first(gaussians))
-        self._density = make_density(config, self._extent, len(self.model), self._generators["density"])
+        bounded = replace(config, density=replace(config.density, max_gaussians=self._budget))
+        self._density = make_density(bounded, self._extent, len(self.model), self._generators["density"])
 
     def _first(self, gaussians: Gaussians) -> Gaussians:
         """The first Gaussians within the budget, in Morton order, as float32 with the run's bands."""
         gaussians = gaussians.to(torch.float32).with_sh_degree(self._max_sh_degree)
-        excess = len(gaussians) > self.config.density.max_gaussians
-        if excess:
+        if len(gaussians) > self._budget:
             chosen = torch.randperm(len(gaussians), generator=self._generators["density"])
-            gaussians = gaussians.select(chosen[: self.config.density.max_gaussians])
+            gaussians = gaussians.select(chosen[: self._budget])
         return gaussians.select(morton_order(gaussians.means))
 
     def advance(self) -> tuple[float, str]:
@@ -86,7 +88,7 @@ class Trainer:
         self.step += 1
         index = self._order.next()
         background = self._background if self._background is not None else self._random_background()
-        target = self._targets.get(index, schedule.downscale(self.step, self.config.schedule.coarse_until), background)
+        target = self._targets.get(index, schedule.downscale(self.step, self._coarse_until), background)
         settings = RasterSettings(
             sh_degree=schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree),
             antialiased=self.config.antialiased,
@@ -176,7 +178,7 @@ class Trainer:
         settled = max(
             schedule.refine_stop(config.density, config.iterations),
             self._max_sh_degree * config.optimizer.sh_degree_every,
-            *config.schedule.coarse_until,
+            *self._coarse_until,
             0,
         )
         return config.schedule.stop_when_flat and self.step > settled and self._flatness.update(loss)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.config import DensityConfig, LossConfig, OptimizerConfig, SparseConfig, TrainConfig
+from gsopt.config import DensityConfig, LossConfig, OptimizerConfig, ScheduleConfig, SparseConfig, TrainConfig
 from gsopt.training import schedule
 from gsopt.training.schedule import Flatness
 
@@ -74,7 +74,7 @@ def test_few_views_raise_weights_and_lower_bands_but_never_the_other_way() -> No
     )
     few, many = schedule.weights(config, 4), schedule.weights(config, 5)
     assert many == schedule.Weights(alpha=0.5, opacity=0.0, scale=0.0)
-    assert few == schedule.Weights(alpha=0.5, opacity=0.01, scale=0.01)
+    assert few == schedule.Weights(alpha=0.5, opacity=config.sparse.lambda_opacity, scale=config.sparse.lambda_scale)
     assert (schedule.max_sh_degree(config, 4), schedule.max_sh_degree(config, 5)) == (1, 3)
 
 
@@ -102,3 +102,21 @@ def test_a_flat_loss_ends_a_run_and_a_falling_one_never_does() -> None:
     flat_end = next(step for step in range(1, 10_000) if flat.update(1.0))
     assert flat_end == flat.window * (1 + Flatness.PATIENCE)
     assert not any(falling.update(0.99 ** (step / 10)) for step in range(5000))
+
+
+def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
+    short, long = TrainConfig(iterations=7000), TrainConfig(iterations=28_000)
+    assert schedule.max_gaussians(short, 50_000) == 72_000
+    assert schedule.max_gaussians(long, 50_000) == 2 * schedule.max_gaussians(short, 50_000)
+    assert schedule.max_gaussians(short, 1) == schedule.SMALLEST_BUDGET
+    assert schedule.max_gaussians(short, 1e9) == schedule.LARGEST_BUDGET
+    given = TrainConfig(density=DensityConfig(max_gaussians=17))
+    assert schedule.max_gaussians(given, 50_000) == 17
+
+
+def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
+    config = TrainConfig(iterations=1000)
+    assert schedule.coarse_until(config, 100) == (60, 230)
+    assert schedule.coarse_until(config, 8) == (167, 500)
+    full = replace(config, schedule=ScheduleConfig(coarse_until=()))
+    assert schedule.coarse_until(full, 100) == ()

@@ -28,6 +28,7 @@ class Adc:
         self, config: DensityConfig, iterations: int, extent: float, count: int, generator: torch.Generator
     ) -> None:
         self._config = config
+        self._budget = schedule.budget(config)
         self._iterations = iterations
         self._extent = extent
         self._generator = generator
@@ -75,7 +76,7 @@ class Adc:
         """Clone small Gaussians and split large ones where the mean gradient is above the threshold; prune both."""
         gaussians = model.gaussians
         scores = self.grad_sum / self.seen.clamp_min(1)
-        room = max(0, self._config.max_gaussians - len(model))
+        room = max(0, self._budget - len(model))
         growing = best(scores > self._config.grow_grad2d, scores, room)
         splitting = growing & (largest_scales(gaussians) > self._config.grow_scale3d * self._extent)
         keep = at_least_one(self._keep(step, gaussians), gaussians.logit_opacities)

@@ -31,6 +31,7 @@ class Mcmc:
 
     def __init__(self, config: DensityConfig, iterations: int, generator: torch.Generator) -> None:
         self._config = config
+        self._budget = schedule.budget(config)
         self._iterations = iterations
         self._generator = generator
 
@@ -83,7 +84,7 @@ class Mcmc:
 
     def _grow(self, model: Model) -> Model:
         """Add copies of Gaussians drawn by opacity, up to growth · N or the budget."""
-        target = min(self._config.max_gaussians, int(self._config.growth * len(model)))
+        target = min(self._budget, int(self._config.growth * len(model)))
         if target <= len(model):
             return model
         sources = draw(model.gaussians.opacities, target - len(model), self._generator)
