@@ -56,7 +56,9 @@ class RenderSettings:
         check.within("--threads", self.threads, 0, 1024, "0 uses every core.")
         low, high = self.elevation_range
         if not -90.0 <= low <= high <= 90.0:
-            raise UsageError(f"`--elevations` must be LOW <= HIGH within -90 to 90 degrees, got {low} {high}.")
+            raise UsageError(
+                f"`--elevations` must be LOW <= HIGH within -90 to 90 degrees, got {low} {high}. Try -15 65."
+            )
         if self.radius is not None:
             check.within("--radius", self.radius, 1.01, 1e4, "The object fills the unit sphere: stay outside of it.")
 
