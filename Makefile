@@ -28,7 +28,7 @@ lint: $(VENV)/.for-test
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
-	$(VENV)/bin/lint-imports
+	$(VENV)/bin/lint-imports --no-logo
 
 $(VENV)/.build-tools: constraints.txt
 	@echo "Installing into $(VENV); the first time takes a few minutes."
