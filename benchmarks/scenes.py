@@ -24,7 +24,8 @@ LEGO, FOX = "nerf_synthetic_lego_400", "fox"
 EIGHT = ["--view-ids", "2,16,26,55,73,75,86,93"]
 # The settings of Kerbl et al. 2023, nothing of ours: 100,000 random points, no regularizer for few views.
 PLAIN = ["--sparse.below-views", "0", "--init", "random", "--init-count", "100000", "--optimizer.lr-means", "1.6e-4"]
-PLAIN += ["--optimizer.lr-means-final", "1.6e-6", "--schedule.coarse-until", "--density.grow-grad2d", "2e-4"]
+PLAIN += ["--optimizer.lr-means-final", "1.6e-6", "--optimizer.lr-log-scales", "5e-3", "--optimizer.lr-sh0", "2.5e-3"]
+PLAIN += ["--optimizer.lr-shN", "1.25e-4", "--schedule.coarse-until", "--max-gaussians", "1000000"]
 CASES: dict[str, tuple[str, list[str]]] = {
     "lego-100": (LEGO, []),
     "lego-100-30k": (LEGO, ["--iterations", "30000"]),

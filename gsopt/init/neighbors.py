@@ -145,5 +145,7 @@ def _merge(
 
 def _squared_distances(tree: _Tree, queries: Tensor, leaf: Tensor, rows: Tensor) -> Float[Tensor, "M P"]:
     """To the points of one leaf per query; infinite to the query itself (`rows` says which point it is)."""
-    x, y, z = (tree.coordinates.index_select(0, leaf).T.reshape(3, -1, len(leaf)) - queries.T[:, None]).unbind(0)
+    x, y, z = (
+        tree.coordinates.index_select(0, leaf).T.reshape(3, tree.leaves.shape[1], len(leaf)) - queries.T[:, None]
+    ).unbind(0)
     return torch.where(rows == tree.leaves.index_select(0, leaf).T, math.inf, x * x + y * y + z * z)

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsopt.init import neighbors
 from gsopt.init.neighbors import mean_neighbor_distance, nearest_distances
 
 
@@ -72,3 +73,12 @@ def test_distances_scale_with_the_points_and_ignore_where_they_are() -> None:
     assert torch.allclose(mean_neighbor_distance(points + 8), base, rtol=1e-3)
     shuffled = torch.randperm(300, generator=torch.Generator().manual_seed(0))
     assert torch.allclose(mean_neighbor_distance(points[shuffled]), base[shuffled], rtol=1e-6)
+
+
+def test_leaves_that_hold_nothing_but_padding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neighbors, "LEAF", 4)
+    monkeypatch.setattr(neighbors, "_LEAVES_AT_ONCE", 1)
+    points = torch.rand(49, 3, generator=torch.Generator().manual_seed(0))
+    distances = torch.cdist(points.double(), points.double()).fill_diagonal_(torch.inf)
+    expected = distances.topk(3, largest=False).values
+    torch.testing.assert_close(neighbors.nearest_distances(points, 3).double(), expected, rtol=1e-4, atol=1e-6)
