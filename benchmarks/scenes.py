@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 RESULTS = Path(__file__).parent / "results" / "scenes.json"
-LEGO, FOX = "nerf_synthetic_lego_400", "fox"
+DEMO, LEGO, FOX = "gsopt/demo", "nerf_synthetic_lego_400", "fox"
 # The eight input views of the few-shot protocol (Jain et al. 2021).
 EIGHT = ["--view-ids", "2,16,26,55,73,75,86,93"]
 # The settings of Kerbl et al. 2023, nothing of ours: 100,000 random points, no regularizer for few views.
@@ -27,6 +27,7 @@ PLAIN = ["--sparse.below-views", "0", "--init", "random", "--init-count", "10000
 PLAIN += ["--optimizer.lr-means-final", "1.6e-6", "--optimizer.lr-log-scales", "5e-3", "--optimizer.lr-sh0", "2.5e-3"]
 PLAIN += ["--optimizer.lr-shN", "1.25e-4", "--schedule.coarse-until", "--max-gaussians", "1000000"]
 CASES: dict[str, tuple[str, list[str]]] = {
+    "demo": (DEMO, ["--iterations", "2000"]),
     "lego-100": (LEGO, []),
     "lego-100-30k": (LEGO, ["--iterations", "30000"]),
     "lego-8": (LEGO, EIGHT),
@@ -39,7 +40,8 @@ KEPT = ("mean", "per_view", "train_seconds", "peak_memory_mb", "n_gaussians", "p
 def run_case(name: str, root: Path, runs: Path) -> dict[str, Any]:
     """Train one case into `runs`/name and return its record."""
     folder, flags = CASES[name]
-    command = ["train", str(root / folder), "-m", str(runs / name), *flags]
+    data = Path(folder) if folder == DEMO else root / folder
+    command = ["train", str(data), "-m", str(runs / name), *flags]
     subprocess.run([sys.executable, "-m", "gsopt", *command], check=True)
     metrics = json.loads((runs / name / "metrics.json").read_text())
     record = {key: metrics.get(key) for key in KEPT}
