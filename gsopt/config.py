@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 
 from gsopt import check
 from gsopt.errors import InputError, UsageError
+from gsopt.guidance_config import GuidanceConfig
 
 T = TypeVar("T")
 
@@ -237,6 +238,7 @@ class TrainConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     sparse: SparseConfig = field(default_factory=SparseConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     iterations: int = 7000
     seed: int = 0
     backend: Literal["auto", "cpu", "reference"] = "auto"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 from pathlib import Path
 
@@ -107,10 +108,10 @@ def test_views_and_view_ids_exclude_each_other() -> None:
 
 def test_every_setting_says_what_it_means() -> None:
     """The command line shows these texts; a field without one would be a flag without help."""
-    source = Path(configuration.__file__).read_text(encoding="utf-8").splitlines()
     for cls in vars(configuration).values():
         if not dataclasses.is_dataclass(cls) or cls is TrainConfig:
             continue
+        source = inspect.getsource(cls).splitlines()
         for field in dataclasses.fields(cls):
             line = next(i for i, text in enumerate(source) if text.startswith(f"    {field.name}: "))
             assert source[line + 1].lstrip().startswith('"""'), f"{cls.__name__}.{field.name} has no docstring"
