@@ -1,9 +1,8 @@
 // Stage 2: visible splats sorted front to back (stable radix sort on depth), then listed per tile in that order.
-// A splat enters a tile only when its ellipse alpha >= 1/255 reaches a pixel centre there (up to a small margin).
 #pragma once
 #include "frame.h"
 #include "parallel.h"
-#include "simd.h"
+#include "tiles.h"
 
 namespace gsopt::GSOPT_ISA {
 
@@ -51,36 +50,6 @@ inline void sort_stage(Pool& pool, Frame& frame) {
     });
   }
 }  // an odd number of passes: the sorted ids are in order2
-
-// Calls visit(tile) for every tile that the splat's ellipse reaches, row by row.
-template <class Visit> inline void for_each_tile(const Frame& frame, const Record& r, Visit&& visit) {
-  if (r.x1 - r.x0 <= 1 || r.y1 - r.y0 <= 1) {  // a row or a column of tiles: the box is good enough
-    for (int y = r.y0; y < r.y1; ++y)
-      for (int x = r.x0; x < r.x1; ++x) visit(y * frame.tiles_x + x);
-    return;
-  }
-  // (A x + B y)² + (C y)² = t bounds the ellipse; over a strip of rows its right end is at the strip's nearest y to
-  // the rightmost point's, y_r = -B/C sqrt(t / (B² + C²)); its left end mirrors that.
-  const float t = (r.log2_opacity - kLog2AlphaMin) * 1.0001f + 1e-3f;
-  const float iA = 1.f / r.A, slope = r.B * iA;
-  const float extreme = -(r.B / r.C) * __builtin_sqrtf(t / (r.B * r.B + r.C * r.C));
-  const auto limit = [](float v, float lo, float hi) { return v < lo ? lo : (v > hi ? hi : v); };
-  for (int y = r.y0; y < r.y1; ++y) {
-    const float top = static_cast<float>(y * kTile) + 0.5f - r.my, bottom = top + (kTile - 1);
-    const float yr = limit(extreme, top, bottom), yl = limit(-extreme, top, bottom);
-    const float sr = t - r.C * yr * (r.C * yr), sl = t - r.C * yl * (r.C * yl);
-    if (sr < 0.f && sl < 0.f) continue;
-    const float margin = 0.02f + 2e-6f * (__builtin_fabsf(slope * yr) + __builtin_fabsf(r.mx));
-    const float right = r.mx - slope * yr + __builtin_sqrtf(sr > 0.f ? sr : 0.f) * iA + margin;
-    const float left = r.mx - slope * yl - __builtin_sqrtf(sl > 0.f ? sl : 0.f) * iA - margin;
-    // Tile x holds the centres 16 x + 0.5 ... 16 x + 15.5.
-    int x0 = static_cast<int>(__builtin_ceilf(limit((left - (kTile - 0.5f)) * (1.f / kTile), -1.f, 65536.f)));
-    int x1 = static_cast<int>(__builtin_floorf(limit((right - 0.5f) * (1.f / kTile), -1.f, 65536.f))) + 1;
-    x0 = x0 > r.x0 ? x0 : r.x0;
-    x1 = x1 < r.x1 ? x1 : r.x1;
-    for (int x = x0; x < x1; ++x) visit(y * frame.tiles_x + x);
-  }
-}
 
 // First pass: how many tiles each splat has, how many splats each tile has (per chunk of the sorted order).
 inline void count_stage(Pool& pool, Frame& frame, int chunks) {

@@ -37,7 +37,7 @@ template <bool Depth> inline void blend_one(BlockState& s, pxi pass, px alpha, c
 template <bool Depth, bool Count>
 inline bool blend_block(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, int count,
                         StoredState& stored, Work& work) {
-  uint16_t buffer[kChunk + 2];
+  uint16_t buffer[kListSize];
   const int n = list_block(words, n_words, block, kChunk, count, buffer);
   const uint16_t* list = buffer + 1;
   px X, Y;

@@ -134,7 +134,7 @@ inline void one_backward(BackwardState& state, const Local& local, int j, pxi pa
 template <bool Depth, bool Abs>
 inline void blend_block_backward(const Local& local, const uint64_t (*words)[kBlocks], int n_words, int block, int first, int count,
                                  BlockGradient& grad, float (*rows)[kRow]) {
-  uint16_t list[kChunk + 2];
+  uint16_t list[kListSize];
   // Splats after the block's last one contributed nothing.
   const int n = list_block(words, n_words, block, grad.highest - first, count, list);
   px X, Y;

@@ -35,7 +35,7 @@ struct alignas(64) Record {
   float b, depth;
   uint16_t x0, x1, y0, y1;  // tiles, half open
   uint32_t slot, count;     // its intersections with tiles: rows [slot, slot + count) of the gradient buffer
-  uint32_t pad[2];
+  uint64_t tiles;           // which tiles of a small box it touches (cpu/tiles.h)
 };
 static_assert(sizeof(Record) == 64);
 

@@ -3,7 +3,7 @@
 #include "../common/sh.h"
 #include "frame.h"
 #include "parallel.h"
-#include "simd.h"
+#include "tiles.h"
 
 namespace gsopt::GSOPT_ISA {
 
@@ -40,18 +40,6 @@ inline f4 sh_color(const Parameters& P, int64_t n, const float Y[][kLanes], int 
   return c;
 }
 
-struct TileBox {
-  int x0, x1, y0, y1;
-};
-inline int clamp_int(float x, int high) {  // floor for x >= 0, safe for any x
-  return x <= 0.f ? 0 : (x >= static_cast<float>(high) ? high : static_cast<int>(x));
-}
-inline TileBox tile_box(const Frame& frame, float mx, float my, float rx, float ry) {
-  constexpr float inv = 1.f / kTile;
-  return {clamp_int((mx - rx) * inv, frame.tiles_x), clamp_int((mx + rx) * inv + 1.f, frame.tiles_x),
-          clamp_int((my - ry) * inv, frame.tiles_y), clamp_int((my + ry) * inv + 1.f, frame.tiles_y)};
-}
-
 // One vector of Gaussians; returns how many ids were appended to `ids`.
 inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, uint32_t* ids) {
   const Camera& cam = frame.camera;
@@ -81,6 +69,11 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
     for (int f = 0; f < 7; ++f) store8(out[f], fields[f]);
     store8(rad[0], rx), store8(rad[1], ry);
   }
+  TileBox boxes[kLanes] = {};
+  uint64_t tiles[kLanes];
+  for (int l = 0; l < lanes; ++l)
+    if (mask >> l & 1) boxes[l] = tile_box(frame, out[0][l], out[1][l], rad[0][l], rad[1][l]);
+  if (mask) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);
   Record* records = frame.records.as<Record>();
   int found = 0;
   for (int l = 0; l < lanes; ++l) {
@@ -91,9 +84,8 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
     const f4 c = sh_color(P, first + l, Y, l, bands);
     r.mx = out[0][l], r.my = out[1][l], r.A = out[2][l], r.B = out[3][l], r.C = out[4][l], r.log2_opacity = out[5][l];
     r.r = c[0] > 0.f ? c[0] : 0.f, r.g = c[1] > 0.f ? c[1] : 0.f, r.b = c[2] > 0.f ? c[2] : 0.f, r.depth = out[6][l];
-    const TileBox box = tile_box(frame, r.mx, r.my, rad[0][l], rad[1][l]);
-    r.x0 = static_cast<uint16_t>(box.x0), r.x1 = static_cast<uint16_t>(box.x1);
-    r.y0 = static_cast<uint16_t>(box.y0), r.y1 = static_cast<uint16_t>(box.y1);
+    r.x0 = static_cast<uint16_t>(boxes[l].x0), r.x1 = static_cast<uint16_t>(boxes[l].x1);
+    r.y0 = static_cast<uint16_t>(boxes[l].y0), r.y1 = static_cast<uint16_t>(boxes[l].y1), r.tiles = tiles[l];
     for (int a = 0; a < 2; ++a) radii[2 * (first + l) + a] = clamp_int(__builtin_ceilf(rad[a][l]), 1 << 30);
     ids[found++] = static_cast<uint32_t>(first + l);
   }

@@ -67,6 +67,21 @@ inline f8 max(f8 a, f8 b) { return a > b ? a : b; }
 inline i8 shift_left(i8 a, i8 n) { return a << n; }
 #endif
 
+// Bit b of lane l becomes bit l of byte b, for the lowest `Bits` bits; the bytes are `stride` apart.
+template <int Bits> inline void gather_bits(i8 lanes, uint8_t* out, int stride) {
+#if defined(__AVX2__)
+  // First the bytes: all lanes' lowest, then all lanes' next. One movemask then takes a bit of every byte.
+  const __m256i group = _mm256_setr_epi8(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15, 0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+  __m256i bytes = _mm256_permutevar8x32_epi32(_mm256_shuffle_epi8((__m256i)lanes, group), _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
+  for (int bit = 7; bit >= 0; --bit, bytes = _mm256_add_epi8(bytes, bytes)) {
+    const uint32_t taken = static_cast<uint32_t>(_mm256_movemask_epi8(bytes));
+    for (int k = 0; k < Bits / 8; ++k) out[(8 * k + bit) * stride] = static_cast<uint8_t>(taken >> (8 * k));
+  }
+#else
+  for (int bit = 0; bit < Bits; ++bit) out[bit * stride] = static_cast<uint8_t>(movemask(lanes << (31 - bit)));
+#endif
+}
+
 inline bool any(i8 m) { return movemask(m) != 0; }
 inline f8 clamp(f8 x, f8 lo, f8 hi) { return min(max(x, lo), hi); }
 

@@ -1,0 +1,86 @@
+// Which tiles a splat is listed in: those where its ellipse alpha >= 1/255 reaches a pixel centre (up to a small margin).
+//
+// (A x + B y)² + (C y)² = t bounds the ellipse. Over a strip of rows its right end lies at the strip's y nearest to that
+// of its rightmost point, y_r = -B/C sqrt(t / (B² + C²)); its left end mirrors that. Tile x holds the pixel centres
+// 16 x + 0.5 ... 16 x + 15.5.
+#pragma once
+#include "frame.h"
+#include "simd.h"
+
+namespace gsopt::GSOPT_ISA {
+
+constexpr int kMaskSide = 8;  // boxes of at most 8x8 tiles carry a mask: bit 8 row + column, relative to (x0, y0)
+
+struct TileBox {
+  int x0, x1, y0, y1;  // half open
+  bool masked() const { return x1 - x0 <= kMaskSide && y1 - y0 <= kMaskSide; }
+};
+inline int clamp_int(float x, int high) {  // floor for x >= 0, safe for any x
+  return x <= 0.f ? 0 : (x >= static_cast<float>(high) ? high : static_cast<int>(x));
+}
+inline TileBox tile_box(const Frame& frame, float mx, float my, float rx, float ry) {
+  constexpr float inv = 1.f / kTile;
+  return {clamp_int((mx - rx) * inv, frame.tiles_x), clamp_int((mx + rx) * inv + 1.f, frame.tiles_x),
+          clamp_int((my - ry) * inv, frame.tiles_y), clamp_int((my + ry) * inv + 1.f, frame.tiles_y)};
+}
+
+// Masks of eight splats at once; of a box that is larger the result is arbitrary.
+inline void tile_masks(f8 mx, f8 my, f8 A, f8 B, f8 C, f8 lo, const TileBox box[kLanes], uint64_t out[kLanes]) {
+  alignas(32) int32_t x0[kLanes], y0[kLanes], columns[kLanes], rows[kLanes], bits[kLanes];
+  int most = 0;
+  for (int l = 0; l < kLanes; ++l) {
+    x0[l] = box[l].x0, y0[l] = box[l].y0, columns[l] = box[l].x1 - box[l].x0, rows[l] = box[l].y1 - box[l].y0, out[l] = 0;
+    most = rows[l] > most && box[l].masked() ? rows[l] : most;
+  }
+  const f8 zero = splat<f8>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f, iA = splat<f8>(1.f) / A, slope = B * iA;
+  const f8 extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
+  const f8 x = mx - to_float(load8i(x0)) * static_cast<float>(kTile), first_row = to_float(load8i(y0)) * static_cast<float>(kTile) + 0.5f - my;
+  const i8 one = splat8i(1), inside = shift_left(one, load8i(columns)) - one;
+  for (int row = 0; row < most; ++row) {
+    const f8 top = first_row + static_cast<float>(row * kTile), bottom = top + (kTile - 1.f);
+    const f8 yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
+    const f8 cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
+    const f8 margin = (abs(slope * yr) + abs(mx)) * 2e-6f + 0.02f;
+    const f8 right = x - slope * yr + sqrt(max(sr, zero)) * iA + margin;
+    const f8 left = x - slope * yl - sqrt(max(sl, zero)) * iA - margin;
+    const i8 behind = to_int(clamp((right + (kTile - 0.5f)) * (1.f / kTile), zero, splat<f8>(kMaskSide + 0.5f)));
+    const i8 first = splat8i(kMaskSide) - to_int(clamp(splat<f8>(kMaskSide) - (left - (kTile - 0.5f)) * (1.f / kTile), zero, splat<f8>(kMaskSide + 0.5f)));
+    const i8 touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside;
+    store8i(bits, touched & ((sr >= 0.f) | (sl >= 0.f)) & (load8i(rows) > splat8i(row)));
+    for (int l = 0; l < kLanes; ++l) out[l] |= static_cast<uint64_t>(bits[l]) << (kMaskSide * row);
+  }
+}
+
+// Calls visit(tile), row by row, for every tile of a splat whose box is too large for a mask.
+template <class Visit> inline void for_each_tile_of_box(const Frame& frame, const Record& r, Visit&& visit) {
+  const float t = (r.log2_opacity - kLog2AlphaMin) * 1.0001f + 1e-3f;
+  const float iA = 1.f / r.A, slope = r.B * iA;
+  const float extreme = -(r.B / r.C) * __builtin_sqrtf(t / (r.B * r.B + r.C * r.C));
+  const auto limit = [](float v, float lo, float hi) { return v < lo ? lo : (v > hi ? hi : v); };
+  for (int y = r.y0; y < r.y1; ++y) {
+    const float top = static_cast<float>(y * kTile) + 0.5f - r.my, bottom = top + (kTile - 1);
+    const float yr = limit(extreme, top, bottom), yl = limit(-extreme, top, bottom);
+    const float sr = t - r.C * yr * (r.C * yr), sl = t - r.C * yl * (r.C * yl);
+    if (sr < 0.f && sl < 0.f) continue;
+    const float margin = 0.02f + 2e-6f * (__builtin_fabsf(slope * yr) + __builtin_fabsf(r.mx));
+    const float right = r.mx - slope * yr + __builtin_sqrtf(sr > 0.f ? sr : 0.f) * iA + margin;
+    const float left = r.mx - slope * yl - __builtin_sqrtf(sl > 0.f ? sl : 0.f) * iA - margin;
+    int x0 = static_cast<int>(__builtin_ceilf(limit((left - (kTile - 0.5f)) * (1.f / kTile), -1.f, 65536.f)));
+    int x1 = static_cast<int>(__builtin_floorf(limit((right - 0.5f) * (1.f / kTile), -1.f, 65536.f))) + 1;
+    x0 = x0 > r.x0 ? x0 : r.x0;
+    x1 = x1 < r.x1 ? x1 : r.x1;
+    for (int x = x0; x < x1; ++x) visit(y * frame.tiles_x + x);
+  }
+}
+
+// Calls visit(tile) for every tile of a splat, row by row.
+template <class Visit> inline void for_each_tile(const Frame& frame, const Record& r, Visit&& visit) {
+  if (!TileBox{r.x0, r.x1, r.y0, r.y1}.masked()) return for_each_tile_of_box(frame, r, visit);
+  const int corner = r.y0 * frame.tiles_x + r.x0;
+  for (uint64_t rest = r.tiles; rest; rest &= rest - 1) {
+    const int bit = __builtin_ctzll(rest);
+    visit(corner + bit / kMaskSide * frame.tiles_x + bit % kMaskSide);
+  }
+}
+
+}  // namespace gsopt::GSOPT_ISA
