@@ -29,15 +29,17 @@ def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
         raise UsageError(f"`{name}` must be one of {', '.join(allowed)}; got {value!r}. Pick one of these.")
 
 
-def finite(name: str, tensor: Tensor) -> None:
-    """Raise InputError naming the first element of `tensor` that is NaN or infinite."""
+def finite(name: str, tensor: Tensor, largest: float = math.inf) -> None:
+    """Raise InputError naming the first element of `tensor` that is NaN, infinite or beyond `largest` in magnitude."""
     import torch
 
-    if tensor.numel() == 0 or bool(torch.isfinite(tensor).all()):
+    good = torch.isfinite(tensor) & (tensor.abs() <= largest)
+    if bool(good.all()):
         return
-    index = tuple(torch.nonzero(~torch.isfinite(tensor))[0].tolist())
+    index = tuple(torch.nonzero(~good)[0].tolist())
     got = tensor[index].item()
-    raise InputError(f"`{name}` must be finite, got {got} at index {list(index)}. Remove or repair that row.")
+    limit = "" if math.isinf(largest) else f" and within {largest:.3g}"
+    raise InputError(f"`{name}` must be finite{limit}, got {got} at index {list(index)}. Remove or repair that row.")
 
 
 def shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:

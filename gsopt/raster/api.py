@@ -17,6 +17,7 @@ from gsopt.raster.autograd import draw
 from gsopt.raster.backend import Backend, RasterSettings
 
 BACKENDS = ("auto", "cpu", "reference")
+FLOAT32_MAX = torch.finfo(torch.float32).max
 DEFAULT_SETTINGS = RasterSettings()
 
 
@@ -104,3 +105,7 @@ def _validate(gaussians: Gaussians, cameras: Cameras, background: Tensor | None)
     if background is not None:
         check.shape("background", background, (3,))
         check.finite("background", background)
+    doubles = [*gaussians.items(), ("viewmats", cameras.viewmats), ("Ks", cameras.Ks), ("background", background)]
+    for name, tensor in doubles:
+        if tensor is not None and tensor.dtype == torch.float64:  # kernels read it as float32, where 1e39 is infinite
+            check.finite(name, tensor, FLOAT32_MAX)
