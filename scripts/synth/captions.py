@@ -1,0 +1,81 @@
+"""A sentence for an object and one for each of its views, from what is known and what the pixels show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from synth.cameras import Shot
+from synth.items import Item
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
+
+SHARE_TO_NAME = 0.25
+"""A second color is named when it covers at least this share of the object."""
+PALETTE = {
+    "white": (235, 235, 235),
+    "light gray": (185, 185, 185),
+    "gray": (125, 125, 125),
+    "dark gray": (70, 70, 70),
+    "black": (25, 25, 25),
+    "red": (190, 40, 40),
+    "orange": (225, 130, 45),
+    "yellow": (225, 205, 60),
+    "green": (70, 145, 65),
+    "turquoise": (70, 180, 175),
+    "blue": (55, 95, 185),
+    "purple": (125, 65, 150),
+    "pink": (225, 140, 170),
+    "brown": (110, 70, 40),
+    "beige": (215, 190, 150),
+}
+
+
+def object_caption(item: Item, counts: dict[str, int]) -> str:
+    """ "a brown and white chair"; the source's own caption where it has one."""
+    if item.caption:
+        return item.caption
+    total = max(sum(counts.values()), 1)
+    ranked = sorted(counts, key=lambda name: (-counts[name], name))[:2]
+    words = " and ".join(name for i, name in enumerate(ranked) if i == 0 or counts[name] / total >= SHARE_TO_NAME)
+    phrase = f"{words} {item.noun.lower() if item.noun.isascii() else item.noun}".strip()
+    return f"{'an' if phrase[0] in 'aeiou' else 'a'} {phrase}"
+
+
+def view_caption(caption: str, shot: Shot, front: tuple[float, float] | None) -> str:
+    """The object's caption and where it is seen from: the side only where the source says which way is front."""
+    eye = shot.eye / np.linalg.norm(shot.eye)
+    places = [] if front is None or abs(eye[2]) > 0.9 else [f"{side_of(eye, front)} view"]
+    elevation = math.degrees(math.asin(float(np.clip(eye[2], -1.0, 1.0))))
+    if abs(elevation) > 20.0:
+        high = "directly " if abs(elevation) > 65.0 else ""
+        places.append(f"seen from {high}{'above' if elevation > 0 else 'below'}")
+    return ", ".join([caption, *places])
+
+
+def side_of(eye: Float[np.ndarray, "3"], front: tuple[float, float]) -> str:
+    """Which of its sides the object shows to a camera at `eye`."""
+    turn = math.degrees(math.atan2(eye[1], eye[0]) - math.atan2(front[1], front[0])) % 360.0
+    return ("front", "left side", "back", "right side")[int((turn + 45.0) // 90.0) % 4]
+
+
+def count_colors(rgba: UInt8[np.ndarray, "H W 4"]) -> dict[str, int]:
+    """How many opaque pixels are nearest to each color of the palette (in coded values, hue weighing double)."""
+    seen = rgba[rgba[..., 3] > 127][::7, :3].astype(np.float64)
+    nearest = np.linalg.norm(opponent(seen)[:, None] - opponent(np.array(list(PALETTE.values()), float)), axis=2)
+    names, counts = np.unique(nearest.argmin(axis=1), return_counts=True)
+    return {list(PALETTE)[i]: int(n) for i, n in zip(names, counts, strict=True)}
+
+
+def opponent(rgb: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Lightness, red against green, blue against yellow."""
+    red, green, blue = rgb.T
+    return np.stack([(red + green + blue) / 3.0, 2.0 * (red - green), 2.0 * (blue - 0.5 * (red + green))], axis=1)
+
+
+def total_colors(counts: Sequence[dict[str, int]]) -> dict[str, int]:
+    return {name: sum(c.get(name, 0) for c in counts) for name in PALETTE if any(name in c for c in counts)}

@@ -1,0 +1,147 @@
+"""A whole run: many objects into one folder, resumable, with dataset.json and failures.json."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsopt.errors import InputError
+from synth.crew import Job, Outcome, do_all
+from synth.export import write_json
+from synth.items import Item
+from synth.render import PARTIAL, RECORD
+from synth.settings import Settings
+
+VERSION = 1
+DATASET, FAILURES, TIMINGS, LOG = "dataset.json", "failures.json", "timings.json", "log.txt"
+FAILED = 3
+"""Exit code of a run in which an object failed."""
+
+
+def run(
+    items: Sequence[Item],
+    settings: Settings,
+    seed: int,
+    out: Path,
+    workers: int = 1,
+    resume: bool = False,
+    time_limit: float = 3600.0,
+) -> int:
+    """Render every item into `out / item.id` and return the exit code: 0, or 3 when any failed.
+
+    What `out` already holds of the same run is kept and not rendered again with `resume`. InputError when `out` holds
+    anything else; nothing there is touched then.
+    """
+    began = time.perf_counter()
+    header = {"version": VERSION, "settings": settings.record(), "seed": seed}
+    open_folder(out, header, resume)
+    todo = [item for item in items if not (out / item.id / RECORD).is_file()]
+    failures = [failure for item in items if item not in todo for failure in changed(out, item)]
+    say(f"{len(items)} objects, {len(items) - len(todo)} of them rendered before, {workers} workers")
+    jobs = [Job(item, settings, object_seed(seed, item.id), out / item.id) for item in todo]
+    outcomes: list[Outcome] = []
+    try:
+        with (out / LOG).open("ab") as log:
+            for outcome in do_all(jobs, workers, log, time_limit):
+                outcomes.append(outcome)
+                say(f"[{len(outcomes)}/{len(jobs)}] {line_about(outcome)}")
+    finally:
+        failures += [failure(o.job.item, o.error) for o in outcomes if o.error]
+        write_whole(out / FAILURES, sorted(failures, key=lambda f: str(f["id"])))
+        write_whole(out / DATASET, header | {"objects": sorted(records(out), key=lambda r: str(r["id"]))})
+        write_whole(out / TIMINGS, timings(outcomes, time.perf_counter() - began))
+    say(f"{len(items) - len(failures)} of {len(items)} objects are in {out}")
+    for lost in failures:
+        say(f"failed: {lost['id']}: {lost['reason']}")
+    return FAILED if failures else 0
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def open_folder(out: Path, header: dict[str, Any], resume: bool) -> None:
+    """Make `out`, or make sure that it belongs to this run; then remove what a killed run left half written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        occupied = any(out.iterdir())
+        if occupied:
+            check_same_run(out, header, resume)
+            for partial in list(out.rglob(PARTIAL + "*")):
+                shutil.rmtree(partial)
+        else:
+            write_whole(out / DATASET, header | {"objects": []})
+    except OSError as error:
+        raise InputError(f"Cannot use the output folder {out}: {error.strerror}. Choose another -o.") from None
+
+
+def check_same_run(out: Path, header: dict[str, Any], resume: bool) -> None:
+    """InputError unless `out` was begun with the same settings and seed and `resume` says to go on."""
+    try:
+        before = json.loads((out / DATASET).read_text(encoding="utf-8"))
+        kept = {"seed": before["seed"], **before["settings"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{out} is not empty and holds no run of synth_views. Choose another -o.") from None
+    asked = json.loads(json.dumps({"seed": header["seed"], **header["settings"]}))
+    differing = [f"{k} {kept.get(k)!r}, now {v!r}" for k, v in asked.items() if kept.get(k) != v]
+    if before.get("version") != header["version"] or differing:
+        raise InputError(f"{out} holds a run with other settings ({'; '.join(differing)}). Choose another -o.")
+    if not resume:
+        raise InputError(f"{out} holds a run already. Add --resume to go on with it, or choose another -o.")
+
+
+def object_seed(seed: int, item_id: str) -> int:
+    """A seed of its own for every object, whichever others are rendered."""
+    return int.from_bytes(hashlib.sha256(f"{seed} {item_id}".encode()).digest()[:4]) >> 1
+
+
+def changed(out: Path, item: Item) -> list[dict[str, str | None]]:
+    """A failure when the mesh is no longer what was rendered: neither is touched."""
+    kept = json.loads((out / item.id / RECORD).read_text(encoding="utf-8"))
+    try:
+        same = hashlib.sha256(item.mesh.read_bytes()).hexdigest() == kept["mesh_sha256"]
+    except OSError:
+        return []  # the mesh is gone, its views are here
+    remedy = f"Remove {out / item.id} to render it again."
+    return [] if same else [failure(item, f"The mesh has changed since it was rendered. {remedy}")]
+
+
+def failure(item: Item, reason: str | None) -> dict[str, str | None]:
+    return {"id": item.id, "mesh": str(item.mesh), "reason": reason}
+
+
+def records(out: Path) -> Iterator[dict[str, Any]]:
+    """The record of every finished object below `out`."""
+    for folder, below, files in os.walk(out):
+        if RECORD in files:
+            below.clear()
+            path = Path(folder) / RECORD
+            yield {"folder": path.parent.relative_to(out).as_posix()} | json.loads(path.read_text(encoding="utf-8"))
+        below[:] = sorted(name for name in below if not name.startswith("."))
+
+
+def timings(outcomes: Sequence[Outcome], seconds: float) -> dict[str, Any]:
+    """How long this invocation took; apart from dataset.json, which is the same whenever the run is."""
+    done = {o.job.item.id: o.seconds for o in outcomes if o.seconds is not None}
+    total = {stage: sum(s[stage] for s in done.values()) for stage in ("stage", "render", "write")}
+    return {"wall_seconds": seconds, "objects": len(done), "seconds_in_workers": total, "by_object": done}
+
+
+def line_about(outcome: Outcome) -> str:
+    if outcome.seconds is None:
+        return f"{outcome.job.item.id}: {outcome.error}"
+    return f"{outcome.job.item.id}: {sum(outcome.seconds.values()):.1f} s"
+
+
+def write_whole(path: Path, content: Any) -> None:
+    """Write beside, then rename: a reader sees the old file or the new one."""
+    beside = path.with_name(f".{path.name}.new")
+    write_json(beside, content)
+    beside.replace(path)
