@@ -12,6 +12,7 @@ from gsopt import __version__
 from gsopt.errors import GsoptError, UsageError
 
 VERBS = {
+    "sfm": "find the poses of photos or a video",
     "train": "learn Gaussians from posed images",
     "render": "draw a finished run as images or a video",
     "eval": "judge a finished run by its held-out views",

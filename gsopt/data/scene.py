@@ -93,7 +93,7 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     if not isinstance(config, DataConfig):
         config = DataConfig(path=str(config))
     root = Path(config.path).expanduser()
-    source = _read(root)
+    source = read_source(root)
     if not source.frames:
         raise InputError(f"{root} has no input view whose image exists. Restore the images, or give another folder.")
     train, test = split(source, config)
@@ -114,7 +114,15 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     )
 
 
-def _read(root: Path) -> Source:
+def is_posed(root: Path) -> bool:
+    """Whether a folder holds a dataset with poses, as far as its files' names tell."""
+    return find_model(root) is not None or any(
+        files.is_regular(root / name) for name in ("transforms_train.json", "transforms.json")
+    )
+
+
+def read_source(root: Path) -> Source:
+    """The dataset in a folder, before anything is chosen. InputError where there is none."""
     if not root.is_dir():
         raise InputError(
             f"The dataset folder {root} does not exist or is no folder. Give the folder that holds the images."

@@ -1,0 +1,169 @@
+"""What a person needs to know: how many photos were placed, which were not and why, and what to do about it."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+
+import numpy as np
+from jaxtyping import Float
+
+from gsopt.data.sfm.features import ViewGraph
+from gsopt.data.sfm.photos import Photo, Refused
+
+BLURRED = 0.25
+"""Share of the set's median sharpness below which a photo counts as blurred."""
+FEW_FEATURES = 200
+WEAK = 30
+"""Features in common below which a pair cannot carry a pose."""
+WIDE_GAP = 35.0
+"""Degrees between neighboring viewing directions above which more photos are advised."""
+REMEDIES = {
+    "blurred": "Take the blurred ones again with a steadier hand or more light.",
+    "featureless": "Plain or glossy surfaces give no features: put something patterned (newspaper) around the object.",
+    "unmatched": "Take photos so that each shares two thirds of its picture with the one before.",
+    "apart": "Photos of different things or places do not belong into one folder: run each group on its own.",
+    "still": "Turning on the spot gives no depth: walk around the object instead.",
+}
+
+
+@dataclass(frozen=True)
+class Left:
+    """A photo without a pose."""
+
+    name: str
+    reason: str
+    kind: str
+    """A key of REMEDIES, or "refused"."""
+
+
+@dataclass
+class Diagnosis:
+    """What is said about one run."""
+
+    given: int
+    """Files that were looked at."""
+    registered: list[str]
+    left: list[Left]
+    advice: list[str] = field(default_factory=list)
+    mapper: str = ""
+    reprojection_error: float | None = None
+    """Mean, px of the full-size photos."""
+    track_length: float | None = None
+    """Mean number of photos a point is seen in."""
+    points: int = 0
+
+    def headline(self) -> str:
+        """One line of figures."""
+        text = f"{len(self.registered)} of {self.given} photos placed"
+        if self.reprojection_error is None or self.track_length is None:
+            return text
+        return (
+            f"{text} ({self.mapper}) | reprojection error {self.reprojection_error:.2f} px | "
+            f"{self.points:,} points, each seen in {self.track_length:.1f} photos"
+        )
+
+    def lines(self) -> list[str]:
+        """The whole report as text: headline, photos by reason, advice."""
+        lines = [self.headline()]
+        by_reason = sorted(self.left, key=lambda left: left.reason)
+        for reason, group in groupby(by_reason, key=lambda left: left.reason):
+            lines.append(f"  not placed: {_names([left.name for left in group])}: {reason}")
+        return lines + [f"  advice: {text}" for text in self.advice]
+
+
+def explain(
+    photos: Sequence[Photo], refused: Sequence[Refused], graph: ViewGraph | None, registered: set[str]
+) -> Diagnosis:
+    """Reasons for every file without a pose, and advice that follows from them."""
+    left = [Left(item.name, item.reason, "refused") for item in refused]
+    usual = statistics.median(photo.sharpness for photo in photos) if photos else 0.0
+    for photo in photos:
+        if photo.name not in registered:
+            kind, reason = why_left(photo, graph, registered, usual)
+            left.append(Left(photo.name, reason, kind))
+    names = [photo.name for photo in photos if photo.name in registered]
+    diagnosis = Diagnosis(len(photos) + len(refused), names, left)
+    diagnosis.advice += gaps([photo.name for photo in photos], registered)
+    kinds = {item.kind for item in left}
+    diagnosis.advice += [text for kind, text in REMEDIES.items() if kind in kinds]
+    return diagnosis
+
+
+def why_left(photo: Photo, graph: ViewGraph | None, registered: set[str], usual: float) -> tuple[str, str]:
+    """(kind, reason) for a photo that was read but has no pose."""
+    blurred = photo.sharpness < BLURRED * usual
+    blur = f"blurred: sharpness {photo.sharpness:.3f}, usual here is {usual:.3f}"
+    if graph is None:
+        return "unmatched", "nothing to compare it with"
+    features = graph.features.get(photo.name, 0)
+    partners = graph.partners(photo.name)
+    if blurred and (features < FEW_FEATURES or sum(partners.values()) < WEAK):
+        return "blurred", blur
+    if features < FEW_FEATURES:
+        return "featureless", f"only {features} features: little to hold on to in it"
+    if not partners:
+        return "unmatched", f"no match: none of its {features:,} features is found again in another photo"
+    if all((min(photo.name, other), max(photo.name, other)) in _ordered(graph.still) for other in partners):
+        return "still", "no depth: it differs from its matches only by a turn or shows one plane"
+    if registered and not registered & set(partners):
+        return "apart", f"matches only photos outside the scene, best {_best(partners)}"
+    known = {name: count for name, count in partners.items() if name in registered} or partners
+    return (
+        ("blurred", f"{blur}; best match {_best(known)}") if blurred else ("unmatched", f"weak match: {_best(known)}")
+    )
+
+
+def gaps(names: Sequence[str], registered: set[str]) -> list[str]:
+    """Runs of photos without a pose between two with one."""
+    advice: list[str] = []
+    before: str | None = None
+    missing = 0
+    for name in names:
+        if name not in registered:
+            missing += 1
+            continue
+        if missing and before is not None:
+            few = "the one" if missing == 1 else f"the {missing}"
+            advice.append(f"Add photos between {before} and {name}: {few} in between found no place.")
+        before, missing = name, 0
+    return advice
+
+
+def wide_gaps(names: Sequence[str], viewmats: Float[np.ndarray, "C 4 4"]) -> list[str]:
+    """Neighbors in name order whose viewing directions differ much more than usual: too little overlap to be sure."""
+    forwards = viewmats[:, 2, :3]
+    turns = np.degrees(np.arccos(np.clip(np.einsum("ci,ci->c", forwards[:-1], forwards[1:]), -1, 1)))
+    if len(turns) < 2:
+        return []
+    limit = max(WIDE_GAP, 3 * float(np.median(turns)))
+    return [
+        f"Add photos between {names[i]} and {names[i + 1]}: their directions differ by {turns[i]:.0f} degrees."
+        for i in np.flatnonzero(turns > limit)[:5]
+    ]
+
+
+def split_groups(graph: ViewGraph, registered: set[str]) -> list[str]:
+    """Photos that match each other but nothing in the scene: another object or place in the same folder."""
+    others = [group for group in graph.groups() if len(group) > 2 and not group & registered]
+    return [
+        f"{len(group)} photos match only each other ({_names(sorted(group))}): another object or place? "
+        "Run them on their own."
+        for group in others
+    ]
+
+
+def _ordered(pairs: frozenset[tuple[str, str]]) -> set[tuple[str, str]]:
+    return {(min(pair), max(pair)) for pair in pairs}
+
+
+def _best(partners: dict[str, int]) -> str:
+    name, count = next(iter(partners.items()))
+    return f"{count} features in common with {name}"
+
+
+def _names(names: Sequence[str], most: int = 6) -> str:
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

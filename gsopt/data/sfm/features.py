@@ -1,0 +1,172 @@
+"""The feature database: cameras, SIFT features, which photos are compared, and what they have in common."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from gsopt.data.sfm.masks import Masked
+from gsopt.data.sfm.photos import Photo
+from gsopt.data.sfm.retrieval import similar_pairs
+from gsopt.data.sfm.settings import SfmConfig
+
+Say = Callable[[str], None]
+Pair = tuple[str, str]
+
+ENOUGH_FOR_OPENCV = 20
+"""Photos with one camera from which on four lens terms are found reliably."""
+EXHAUSTIVE_UP_TO = 200
+NEIGHBORS_IN_TIME = 10
+LOOPS, LOOK_ALIKES = 5, 30
+"""Look-alikes each photo is compared with: to close loops of a video, and instead of all others."""
+_PAIRS_AT_ONCE = 400
+"""Progress is told in between."""
+
+
+@dataclass(frozen=True)
+class ViewGraph:
+    """What feature matching found, by photo name."""
+
+    features: dict[str, int]
+    inliers: dict[Pair, int]
+    """Features two photos have in common after geometric verification; pairs without any are absent."""
+    still: frozenset[Pair]
+    """Pairs explained by a plane or by turning on the spot: they carry no depth on their own."""
+
+    def partners(self, name: str) -> dict[str, int]:
+        """Photos that `name` has features in common with, and how many."""
+        found = {b if a == name else a: n for (a, b), n in self.inliers.items() if name in (a, b)}
+        return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
+
+    def groups(self) -> list[set[str]]:
+        """Photos connected by matches, largest group first; a photo without a match is a group of its own."""
+        group = {name: {name} for name in self.features}
+        for a, b in self.inliers:
+            if group[a] is not group[b]:
+                merged = group[a] | group[b]
+                group.update(dict.fromkeys(merged, merged))
+        distinct = {id(members): members for members in group.values()}.values()
+        return sorted(distinct, key=lambda members: (-len(members), min(members)))
+
+
+def extract(pycolmap: ModuleType, database: Path, photos: Sequence[Photo], masked: Masked, config: SfmConfig) -> None:
+    """Features of all photos, one camera for each lens, zoom and size."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = config.threads or -1
+    options.max_image_size = config.max_size
+    options.sift.max_num_features = config.features
+    for shared in cameras(photos):
+        reader = reader_options(pycolmap, shared, config)
+        if masked.masks is not None:
+            reader.mask_path = masked.masks
+        pycolmap.extract_features(
+            database,
+            masked.photos,
+            image_names=[photo.name for photo in shared],
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=options,
+        )
+
+
+def cameras(photos: Iterable[Photo]) -> list[list[Photo]]:
+    """Photos that share a camera, in order of first appearance."""
+    groups: dict[str, list[Photo]] = {}
+    for photo in photos:
+        groups.setdefault(photo.camera, []).append(photo)
+    return list(groups.values())
+
+
+def reader_options(pycolmap: ModuleType, shared: Sequence[Photo], config: SfmConfig) -> Any:
+    """Lens model and first guess for photos of one camera."""
+    model = config.camera_model
+    if model == "auto":
+        model = "OPENCV" if len(shared) >= ENOUGH_FOR_OPENCV else "SIMPLE_RADIAL"
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = model
+    focal = config.focal or shared[0].focal
+    if focal is not None:
+        camera = pycolmap.Camera.create_from_model_name(0, model, focal, shared[0].width, shared[0].height)
+        options.camera_params = camera.params_to_string()
+    return options
+
+
+def choose_matching(config: SfmConfig, count: int, is_video: bool) -> str:
+    """What `auto` becomes."""
+    if config.matching != "auto":
+        return config.matching
+    if is_video:
+        return "sequential"
+    return "exhaustive" if count <= EXHAUSTIVE_UP_TO else "retrieval"
+
+
+def match(
+    pycolmap: ModuleType, database: Path, names: Sequence[str], matching: str, config: SfmConfig, say: Say
+) -> ViewGraph:
+    """Compare the photos that `matching` picks, verify each pair geometrically, and return the graph."""
+    pairs = pairs_to_match(pycolmap, database, names, matching, config.seed)
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = config.threads or -1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+        part = pairs[start : start + _PAIRS_AT_ONCE]
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in part), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            database, matching_options=options, pairing_options=pairing, verification_options=verification
+        )
+        say(f"compared {start + len(part):,} of {len(pairs):,} pairs of photos ({matching})")
+    return read_graph(pycolmap, database)
+
+
+def pairs_to_match(pycolmap: ModuleType, database: Path, names: Sequence[str], matching: str, seed: int) -> list[Pair]:
+    """Pairs in an order that does not depend on how they were found."""
+    if matching == "exhaustive":
+        return list(itertools.combinations(names, 2))
+    pairs = set(neighbors_in_time(names))
+    if len(names) > NEIGHBORS_IN_TIME:
+        descriptors = read_descriptors(pycolmap, database, names)
+        most = LOOPS if matching == "sequential" else LOOK_ALIKES
+        pairs |= {(names[i], names[j]) for i, j in similar_pairs(descriptors, most, seed)}
+    rank = {name: position for position, name in enumerate(names)}
+    return sorted(pairs, key=lambda pair: (rank[pair[0]], rank[pair[1]]))
+
+
+def neighbors_in_time(names: Sequence[str]) -> Iterable[Pair]:
+    """Each photo with the next ten, and with those 16, 32, 64, ... later."""
+    steps = [*range(1, NEIGHBORS_IN_TIME + 1), *(2**power for power in range(4, 9))]
+    return ((names[i], names[i + step]) for step in steps for i in range(len(names) - step))
+
+
+def read_descriptors(pycolmap: ModuleType, database: Path, names: Sequence[str]) -> list[Any]:
+    """SIFT descriptors of each photo, uint8 [F, 128]."""
+    with pycolmap.Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        return [db.read_descriptors(ids[name]).data for name in names]
+
+
+def read_graph(pycolmap: ModuleType, database: Path) -> ViewGraph:
+    """The graph that lies in a database."""
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    without_depth = {int(kinds.PANORAMIC), int(kinds.PLANAR_OR_PANORAMIC), int(kinds.PLANAR)}
+    inliers: dict[Pair, int] = {}
+    still: set[Pair] = set()
+    with pycolmap.Database.open(database) as db:
+        names = {image.image_id: image.name for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(image_id) for image_id, name in names.items()}
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            count = len(geometry.inlier_matches)
+            if count == 0:
+                continue
+            pair = (names[first], names[second])
+            inliers[pair] = count
+            if geometry.config in without_depth:
+                still.add(pair)
+    return ViewGraph(features, inliers, frozenset(still))

@@ -1,0 +1,153 @@
+"""Camera poses and points from matches: incremental, global, or global with incremental repair.
+
+Everything here runs on one thread: sums over several threads would give other bits on every run.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from gsopt.data.sfm.features import Say, ViewGraph
+from gsopt.data.sfm.settings import SfmConfig
+
+INCREMENTAL_UP_TO = 300
+"""Photos up to which `auto` maps incrementally: slower per photo, but it loses fewer."""
+SATISFIED = 0.9
+"""Share of the photos below which `auto` tries the other mapper."""
+SMALLEST_MODEL = 3
+ENOUGH_FOR_CENTER = 10
+"""Photos of one camera from which on the last adjustment may move its principal point."""
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The largest reconstruction that was found."""
+
+    reconstruction: Any
+    """pycolmap.Reconstruction."""
+    mapper: str
+    """Which one made it."""
+    others: list[set[str]]
+    """Photos of smaller reconstructions that could not be joined to it."""
+
+    @property
+    def names(self) -> set[str]:
+        """Registered photos."""
+        return registered(self.reconstruction)
+
+
+def registered(reconstruction: Any) -> set[str]:
+    """Names of the photos that have a pose."""
+    return {reconstruction.image(i).name for i in reconstruction.reg_image_ids()}
+
+
+def find_poses(
+    pycolmap: ModuleType, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig, say: Say
+) -> Mapped | None:
+    """The best reconstruction of the mappers that `config.mapper` allows; None when no three photos fit together."""
+    best: Mapped | None = None
+    count = len(graph.features)
+    for mapper in mappers_to_try(config, count):
+        models = run_mapper(pycolmap, mapper, database, photos, graph, config)
+        if not models:
+            say(f"{mapper} mapping placed no photo")
+            continue
+        largest = models[0]
+        others = [registered(model) - registered(largest) for model in models[1:]]
+        mapped = Mapped(largest, mapper, [names for names in others if names])
+        say(f"{mapper} mapping placed {len(mapped.names)} of {count} photos")
+        if best is None or len(mapped.names) > len(best.names):
+            best = mapped
+        if len(best.names) >= SATISFIED * count:
+            break
+    if best is None or len(best.names) < SMALLEST_MODEL:
+        return None
+    adjust(pycolmap, best.reconstruction, config)
+    return best
+
+
+def mappers_to_try(config: SfmConfig, count: int) -> list[str]:
+    """What `auto` becomes: a first choice, and another for when that leaves many photos out."""
+    if config.mapper != "auto":
+        return [config.mapper]
+    return ["incremental", "hybrid"] if count <= INCREMENTAL_UP_TO else ["hybrid", "incremental"]
+
+
+def run_mapper(
+    pycolmap: ModuleType, mapper: str, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig
+) -> list[Any]:
+    """Reconstructions, the one with most photos first."""
+    pycolmap.set_random_seed(config.seed)
+    target = database.with_name(mapper)
+    target.mkdir()
+    if mapper == "incremental":
+        models = _incremental(pycolmap, database, photos, target, config)
+    else:
+        models = _global(pycolmap, database, photos, target, config)
+    if mapper == "hybrid" and models and len(registered(models[0])) < len(graph.features):
+        models = _repaired(pycolmap, models, database, photos, target, config)
+    return sorted(models, key=lambda model: (-model.num_reg_images(), min(registered(model))))
+
+
+def adjust(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> None:
+    """A last bundle adjustment over everything; where many photos share a camera, its principal point may move."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = config.focal is None
+    options.refine_principal_point = reconstruction.num_reg_images() >= ENOUGH_FOR_CENTER * len(reconstruction.cameras)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(reconstruction, options)
+    pycolmap.ObservationManager(reconstruction).filter_all_points3D(4.0, 1.5)
+    reconstruction.update_point_3d_errors()
+
+
+def incremental_options(pycolmap: ModuleType, config: SfmConfig) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = SMALLEST_MODEL
+    options.num_threads = 1
+    options.random_seed = config.seed
+    options.ba_refine_focal_length = config.focal is None
+    return options
+
+
+def _incremental(
+    pycolmap: ModuleType, database: Path, photos: Path, target: Path, config: SfmConfig, start: Path | str = ""
+) -> list[Any]:
+    options = incremental_options(pycolmap, config)
+    options.multiple_models = not start
+    models = pycolmap.incremental_mapping(database, photos, target, options=options, input_path=start)
+    return [model for _, model in sorted(models.items())]
+
+
+def _global(pycolmap: ModuleType, database: Path, photos: Path, target: Path, config: SfmConfig) -> list[Any]:
+    """Global mapping of a copy of the database: calibrating the view graph writes to it."""
+    calibrated = target / "database.db"
+    shutil.copyfile(database, calibrated)
+    if config.focal is None:
+        calibration = pycolmap.ViewGraphCalibrationOptions()
+        calibration.random_seed = config.seed
+        pycolmap.calibrate_view_graph(calibrated, calibration)
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = config.seed
+    options.min_model_size = SMALLEST_MODEL
+    options.mapper.bundle_adjustment.refine_focal_length = config.focal is None
+    models = pycolmap.global_mapping(calibrated, photos, target, options)
+    return [model for _, model in sorted(models.items())]
+
+
+def _repaired(
+    pycolmap: ModuleType, models: list[Any], database: Path, photos: Path, target: Path, config: SfmConfig
+) -> list[Any]:
+    """The largest global model, grown incrementally by the photos it left out."""
+    start, grown = target / "start", target / "grown"
+    start.mkdir()
+    grown.mkdir()
+    largest = max(models, key=lambda model: model.num_reg_images())
+    largest.write(start)
+    return _incremental(pycolmap, database, photos, grown, config, start) or models

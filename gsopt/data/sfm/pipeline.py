@@ -1,0 +1,233 @@
+"""`pose_photos`: from a folder of photos or a video to a posed scene folder, or to a report that says why not.
+
+photos ─► features ─► pairs and matches ─► mapping ─► placement ─► undistorted scene + sfm.json + sfm.png
+Nothing is left behind but the finished folder: all work happens under a hidden name beside it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gsopt import __version__
+from gsopt._optional import require
+from gsopt.data.scene import read_source
+from gsopt.data.sfm import diagnosis, features, mapping, prior
+from gsopt.data.sfm.diagnosis import Diagnosis
+from gsopt.data.sfm.features import Say, ViewGraph
+from gsopt.data.sfm.masks import Masked, prepare_masks
+from gsopt.data.sfm.photos import Photo, Refused, find_photos, read_photos
+from gsopt.data.sfm.picture import draw_scene
+from gsopt.data.sfm.placement import Similarity, place
+from gsopt.data.sfm.refusal import too_few
+from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.video import extract_frames, is_video
+from gsopt.data.sfm.writing import write_scene
+from gsopt.data.source import Frame
+from gsopt.errors import InputError, UsageError
+from gsopt.events import to_json, write_atomic
+
+RECORD, PICTURE = "sfm.json", "sfm.png"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A scene that was written."""
+
+    path: Path
+    diagnosis: Diagnosis
+    seconds: dict[str, float]
+    """Wall time by stage."""
+
+
+def pose_photos(source: Path, out: Path, config: SfmConfig, say: Say = lambda line: None) -> Posed:
+    """Find the poses of the photos in `source` (or of the frames of a video) and write the scene folder `out`.
+
+    Raises InputError with the whole report when fewer than three photos can be placed, UsageError when `out` exists,
+    MissingDependency without pycolmap. In each case `out` is as it was.
+    """
+    source, out = source.expanduser().absolute(), out.expanduser().absolute()
+    if not source.exists():
+        raise InputError(f"{source} does not exist. Give a folder of photos or a video.")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
+    pycolmap = require("pycolmap", "sfm", "Finding camera poses")
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
+    with _working_folder(out) as work:
+        run = _Run(pycolmap, source, work, config, say)
+        scene, report = run.posed()
+        if out.is_dir():
+            out.rmdir()
+        os.replace(scene, out)
+    return Posed(out, report, run.seconds)
+
+
+class _Run:
+    """One pass through the stages, with their times."""
+
+    def __init__(self, pycolmap: ModuleType, source: Path, work: Path, config: SfmConfig, say: Say) -> None:
+        self.pycolmap, self.source, self.work, self.config, self.say = pycolmap, source, work, config, say
+        self.database = work / "database.db"
+        self.seconds: dict[str, float] = {}
+
+    def posed(self) -> tuple[Path, Diagnosis]:
+        """The finished scene folder inside the working folder, and what there is to say about it."""
+        with self._timed("photos"):
+            photos, refused = self._photos()
+            frames = self._prior_frames(photos)
+            if len(photos) == 1 or (not photos and refused):
+                raise too_few(diagnosis.explain(photos, refused, None, set()), None)
+            masked = prepare_masks(self.config.masks, self.source, photos, self.work)
+        graph, matching = self._graph(photos, masked, frames)
+        with self._timed("mapping"):
+            mapped = self._mapped(masked, graph, frames)
+        if mapped is None or len(mapped.names) < mapping.SMALLEST_MODEL:
+            raise too_few(diagnosis.explain(photos, refused, graph, set()), graph)
+        report = self._diagnose(photos, refused, graph, mapped)
+        with self._timed("writing"):
+            scene = self._write(report, mapped, masked, matching, similarity=self._placed(mapped, frames))
+        return scene, report
+
+    def _photos(self) -> tuple[list[Photo], list[Refused]]:
+        if not is_video(self.source):
+            paths = find_photos(self.source)
+        else:
+            chosen = extract_frames(self.source, self.work / "frames", self.config.frames)
+            self.say(f"took {len(chosen.paths)} of {chosen.decoded:,} frames ({chosen.seconds:.1f} s of video)")
+            paths = chosen.paths
+        photos, refused = read_photos(paths, self.work)
+        self.say(f"read {len(photos)} photos" + (f", refused {len(refused)}" if refused else ""))
+        return photos, refused
+
+    def _prior_frames(self, photos: list[Photo]) -> list[Frame] | None:
+        """The known poses of these photos (`--poses prior`)."""
+        if self.config.poses != "prior":
+            return None
+        source = read_source(self.source)
+        frames = [*source.frames, *(source.held_out or [])]
+        known = {frame.path.name: frame for frame in frames}
+        unknown = [photo.name for photo in photos if photo.source.name not in known]
+        if unknown:
+            raise InputError(
+                f"`--poses prior` needs a pose for every photo; {len(unknown)} have none: {unknown[0]}, ... "
+                "Remove them, or drop the flag to find all poses."
+            )
+        for i, photo in enumerate(photos):
+            frame = known[photo.source.name]
+            photos[i] = replace(photo, camera=prior.camera_key(frame))
+        return [replace(known[photo.source.name], name=photo.name) for photo in photos]
+
+    def _graph(self, photos: list[Photo], masked: Masked, frames: list[Frame] | None) -> tuple[ViewGraph, str]:
+        names = [photo.name for photo in photos]
+        matching = features.choose_matching(self.config, len(names), is_video(self.source))
+        with self._timed("features"):
+            self.say(f"looking for features in {len(names)} photos (masks: {masked.kind})")
+            features.extract(self.pycolmap, self.database, photos, masked, self.config)
+            if frames is not None:
+                prior.write_cameras(self.pycolmap, self.database, frames)
+        with self._timed("matching"):
+            graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.say)
+        return graph, matching
+
+    def _mapped(self, masked: Masked, graph: ViewGraph, frames: list[Frame] | None) -> mapping.Mapped | None:
+        if frames is None:
+            return mapping.find_poses(self.pycolmap, self.database, masked.photos, graph, self.config, self.say)
+        found = prior.triangulate(self.pycolmap, self.database, masked.photos, frames, self.config)
+        return mapping.Mapped(found, "poses as given", [])
+
+    def _diagnose(
+        self, photos: list[Photo], refused: list[Refused], graph: ViewGraph, mapped: mapping.Mapped
+    ) -> Diagnosis:
+        report = diagnosis.explain(photos, refused, graph, mapped.names)
+        report.mapper = mapped.mapper
+        report.reprojection_error = mapped.reconstruction.compute_mean_reprojection_error()
+        report.track_length = mapped.reconstruction.compute_mean_track_length()
+        report.points = mapped.reconstruction.num_points3D()
+        report.advice += diagnosis.split_groups(graph, mapped.names)
+        names, viewmats = poses(mapped.reconstruction)
+        report.advice += diagnosis.wide_gaps(names, viewmats)
+        return report
+
+    def _placed(self, mapped: mapping.Mapped, frames: list[Frame] | None) -> Similarity:
+        """Known poses stay where they are; found ones get axes, origin and scale."""
+        if frames is not None:
+            return Similarity.identity()
+        return place(poses(mapped.reconstruction)[1], points(mapped.reconstruction)[0])
+
+    def _write(
+        self, report: Diagnosis, mapped: mapping.Mapped, masked: Masked, matching: str, similarity: Similarity
+    ) -> Path:
+        scene = write_scene(self.pycolmap, mapped.reconstruction, self.work, masked, similarity, self.config.undistort)
+        names, viewmats = poses(mapped.reconstruction)
+        xyz, rgb = points(mapped.reconstruction)
+        write_atomic(scene / PICTURE, draw_scene(viewmats, names, xyz, rgb, report.headline()))
+        record = {
+            "version": VERSION,
+            "gsopt": __version__,
+            "pycolmap": self.pycolmap.__version__,
+            "source": str(self.source),
+            "fingerprint": fingerprint(self.source),
+            "settings": asdict(self.config),
+            "matching": matching,
+            "masks": masked.kind,
+            **asdict(report),
+            "placed_from_found": {
+                "scale": similarity.scale,
+                "rotation": similarity.rotation.tolist(),
+                "translation": similarity.translation.tolist(),
+            },
+            "seconds": {stage: round(seconds, 2) for stage, seconds in self.seconds.items()},
+        }
+        write_atomic(scene / RECORD, to_json(record))
+        return scene
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.seconds[stage] = time.perf_counter() - began
+
+
+def poses(reconstruction: Any) -> tuple[list[str], Float[np.ndarray, "C 4 4"]]:
+    """Names in order and cam_from_world of the registered photos."""
+    images = sorted((reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
+    viewmats = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
+    return [image.name for image in images], viewmats
+
+
+def points(reconstruction: Any) -> tuple[Float[np.ndarray, "P 3"], Any]:
+    """Positions and colors (uint8)."""
+    found = list(reconstruction.points3D.values())
+    xyz = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
+    return xyz, np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3)
+
+
+def fingerprint(source: Path) -> list[list[Any]]:
+    """Name, size and time of each input file: tells whether a scene was made from what is there now."""
+    paths = [source] if is_video(source) else find_photos(source)
+    return [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
+
+
+@contextmanager
+def _working_folder(out: Path) -> Iterator[Path]:
+    """A hidden folder beside `out`, gone afterwards whatever happens."""
+    work = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    try:
+        work.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"Cannot write beside {out}: {error.strerror or error}. Choose another `--out`.") from error
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)

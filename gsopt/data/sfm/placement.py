@@ -1,0 +1,84 @@
+"""Where the world's axes go: z up, the cameras' common focus at the origin, their typical distance to it 1.
+
+Structure from motion leaves position, orientation and scale open. The similarity chosen here is recorded with the
+scene, so that it can be taken back: x_placed = scale · rotation · x_found + translation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+FLAT = 0.02
+"""Below this share of the cameras' x axes in a second direction, all look the same way and tell no horizon."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_placed = scale · rotation · x_found + translation."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """placed_from_found, homogeneous."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+    @staticmethod
+    def identity() -> Similarity:
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def place(viewmats: Float[np.ndarray, "C 4 4"], points: Float[np.ndarray, "P 3"]) -> Similarity:
+    """The similarity for cameras (cam_from_world, OpenCV axes) and the points they saw."""
+    rotation = rotation_to_z(up_direction(viewmats))
+    centers = -np.einsum("cij,ci->cj", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    focus = common_focus(centers, viewmats[:, 2, :3], points)
+    scale = 1 / max(float(np.median(np.linalg.norm(centers - focus, axis=1))), 1e-12)
+    return Similarity(scale, rotation, -scale * rotation @ focus)
+
+
+def up_direction(viewmats: Float[np.ndarray, "C 4 4"]) -> Float[np.ndarray, "3"]:
+    """Unit vector: perpendicular to the cameras' x axes, which people hold level, on the side of the image tops.
+
+    Where all cameras look the same way the x axes are parallel; then it is the mean of the image tops.
+    """
+    tops = -viewmats[:, 1, :3].mean(axis=0)
+    values, vectors = np.linalg.eigh(viewmats[:, 0, :3].T @ viewmats[:, 0, :3])
+    up = vectors[:, 0] if values[1] > FLAT * values.sum() else tops
+    if abs(up @ tops) < 0.3 * np.linalg.norm(tops):  # cameras that lie on their side: the horizon is not their x axis
+        up = tops
+    norm = float(np.linalg.norm(up))
+    up = up / norm if norm > 1e-9 else np.array([0.0, 0.0, 1.0])
+    return up if up @ tops >= 0 else -up
+
+
+def common_focus(
+    centers: Float[np.ndarray, "C 3"], forwards: Float[np.ndarray, "C 3"], points: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "3"]:
+    """The point closest to all optical axes; where it does not lie in front of the cameras, the points' median."""
+    away = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    normal = away.sum(axis=0)
+    fallback = np.median(points, axis=0) if len(points) else centers.mean(axis=0)
+    if np.linalg.cond(normal) > 1e4:
+        return fallback
+    focus = np.linalg.solve(normal, np.einsum("cij,cj->i", away, centers))
+    depths = np.einsum("ci,ci->c", focus - centers, forwards)
+    return focus if float((depths > 0).mean()) > 0.9 else fallback
+
+
+def rotation_to_z(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes the unit vector `up` to +z (Rodrigues)."""
+    z = np.array([0.0, 0.0, 1.0])
+    cosine = float(up @ z)
+    if cosine < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, w = np.cross(up, z)
+    cross = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
