@@ -31,10 +31,14 @@ class RunConsole:
         match event["kind"]:
             case "started":
                 self.say(started_line(event, self._run))
+                if (guidance := event.get("guidance")) is not None and guidance["prior"] is None:
+                    self.say(f"guidance off: {guidance['reason']}")
                 self._tenths = _tenths(event)
                 self._begin(event)
             case "warning":
                 self.say(f"warning: {event['message']}")
+            case "guidance":
+                self.say(f"guidance: {event['message']}")
             case "progress":
                 self._progress(event)
             case "stopped":

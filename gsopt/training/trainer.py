@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -24,6 +24,9 @@ from gsopt.training.optimizer import Model, adam_step, learning_rates
 from gsopt.training.order import ViewOrder, generators
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
 from gsopt.training.targets import BACKGROUNDS, Target, Targets, content_pixels
+
+if TYPE_CHECKING:
+    from gsopt.training.guidance import RunGuidance
 
 # The PSNR that is shown is taken every so many steps: the mean squared error costs a pass over the image.
 PSNR_EVERY = 10
@@ -51,7 +54,15 @@ class Shown:
 class Trainer:
     """Owns the model, its density control and all random numbers of one run."""
 
-    def __init__(self, config: TrainConfig, scene: Scene, gaussians: Gaussians, backend: Backend) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        scene: Scene,
+        gaussians: Gaussians,
+        backend: Backend,
+        guidance: RunGuidance | None = None,
+    ) -> None:
+        """`guidance` None: learn from the input views alone."""
         views = len(scene.train)
         self.config = config
         self.scene = scene
@@ -59,6 +70,7 @@ class Trainer:
         self.step = 0
         self.shown = Shown()
         self.finished_early = False
+        self._guidance = guidance
         self._sparse = schedule.is_sparse(config, views)
         self._weights = schedule.weights(config, views)
         self._max_sh_degree = schedule.max_sh_degree(config, views)
@@ -89,15 +101,21 @@ class Trainer:
         index = self._order.next()
         background = self._background if self._background is not None else self._random_background()
         target = self._targets.get(index, schedule.downscale(self.step, self._coarse_until), background)
-        settings = RasterSettings(
-            sh_degree=schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree),
-            antialiased=self.config.antialiased,
-        )
+        settings = self.settings()
         loss, gradients = self._gradients(target, background, settings)
+        if self._guidance is not None:
+            self._guidance.add(self.step, self.model.gaussians, settings, gradients)
         self._update(gradients, settings.sh_degree)
         self._change_set()
         self.finished_early = self._is_flat(loss)
         return loss, self.scene.train[index].name
+
+    def settings(self) -> RasterSettings:
+        """How the current step draws."""
+        return RasterSettings(
+            sh_degree=schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree),
+            antialiased=self.config.antialiased,
+        )
 
     def _random_background(self) -> Float[Tensor, "3"]:
         return torch.rand(3, generator=self._generators["background"])
@@ -160,6 +178,8 @@ class Trainer:
             moved = True
         if moved:
             self._select(morton_order(self.model.gaussians.means))
+            if self._guidance is not None:
+                self._guidance.forget()
 
     def _select(self, rows: Tensor) -> None:
         self.model = self.model.select(rows)
@@ -184,10 +204,16 @@ class Trainer:
         return config.schedule.stop_when_flat and self.step > settled and self._flatness.update(loss)
 
     @staticmethod
-    def resumed(config: TrainConfig, scene: Scene, backend: Backend, checkpoint: Checkpoint) -> Trainer:
+    def resumed(
+        config: TrainConfig,
+        scene: Scene,
+        backend: Backend,
+        checkpoint: Checkpoint,
+        guidance: RunGuidance | None = None,
+    ) -> Trainer:
         """A trainer as it was when the checkpoint was written; InputError when that belongs to another run."""
         try:
-            trainer = Trainer(config, scene, _record(checkpoint.tensors, "gaussians"), backend)
+            trainer = Trainer(config, scene, _record(checkpoint.tensors, "gaussians"), backend, guidance)
             trainer._restore(checkpoint.tensors, checkpoint.meta)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(
@@ -209,6 +235,9 @@ class Trainer:
             "finished_early": self.finished_early,
             "shown": {"loss": self.shown.loss, "mse": self.shown.mse},
         }
+        if self._guidance is not None:
+            guiding, meta["guidance"] = self._guidance.state()
+            tensors |= {f"guidance.{name}": tensor for name, tensor in guiding.items()}
         return tensors, meta
 
     def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -216,7 +245,9 @@ class Trainer:
         gaussians, exp_avg, exp_avg_sq = (_record(tensors, kind) for kind in RECORDS)
         _require_same_shapes(gaussians.validate(), exp_avg, exp_avg_sq)
         self.model = Model(gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS})
-        self._density.restore({k.removeprefix("density."): v for k, v in tensors.items() if k.startswith("density.")})
+        self._density.restore(_part(tensors, "density."))
+        if self._guidance is not None:
+            self._guidance.restore(_part(tensors, "guidance."), meta["guidance"])
         for name, generator in self._generators.items():
             generator.set_state(tensors[f"rng.{name}"])
         self._order.restore(tensors["epoch.order"], int(meta["epoch_position"]))
@@ -224,6 +255,10 @@ class Trainer:
         self.finished_early = bool(meta["finished_early"])
         self.shown = Shown(**meta["shown"])
         self.step = int(meta["step"])
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 def _record(tensors: dict[str, Tensor], kind: str) -> Gaussians:

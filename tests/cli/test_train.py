@@ -94,7 +94,9 @@ def test_no_flag_is_the_default_configuration() -> None:
         ("--optimizer.sh-degree 1", "optimizer.sh_degree", 1),
         ("--sparse.below-views 0", "sparse.below_views", 0),
         ("--schedule.coarse-until 5 10", "schedule.coarse_until", [5, 10]),
-        ("--lambda_sds 0", "seed", 0),
+        ("--lambda_sds 0", "guidance.lambda_sds", 0),
+        ("--prior sd21", "guidance.prior", "sd21"),
+        ("--guidance.every 9", "guidance.every", 9),
     ],
 )
 def test_every_flag_sets_its_setting_and_no_other(flags: str, key: str, value: object) -> None:

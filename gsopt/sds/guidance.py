@@ -1,0 +1,289 @@
+"""One guided step: look where the inputs say little, ask the prior, and turn its answer into gradients of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.cameras import Cameras
+from gsopt.data.scene import Scene
+from gsopt.errors import NumericalError
+from gsopt.gaussians import Gaussians
+from gsopt.guidance_config import GuidanceConfig
+from gsopt.raster.backend import Backend, Gradients, RasterSettings
+from gsopt.sds import coverage, policies, schedule
+from gsopt.sds.conditioning import Conditioning
+from gsopt.sds.noise import Latents, generator
+from gsopt.sds.prior import Condition, Images, Pair, Prior, Scale
+from gsopt.sds.views import draw_candidate, make_rig, nearest, square_views
+
+COVERAGE_EVERY = 100
+"""Steps after which coverage is taken anew even if no Gaussian came or went."""
+MOST_FAILURES = 3
+"""Failed calls in a row after which the run goes on without guidance."""
+GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
+
+Warn = Callable[[str], None]
+
+
+@dataclass
+class Counts:
+    """What became of the steps that the schedule wanted guided."""
+
+    guided: int = 0
+    decided: int = 0
+    """Left alone because the input views decide everywhere."""
+    failed: int = 0
+    """Left alone because the prior failed."""
+    failed_in_a_row: int = 0
+    ended: bool = False
+    """After too many failures in a row."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one guided step saw, for the report."""
+
+    step: int
+    view: int
+    text: str
+    render: Float[Tensor, "3 S S"]
+    uncertainty: Float[Tensor, "S S"]
+    x0: Latents | None
+    """The prior's estimate in its own space; None where `target` is it."""
+    target: Float[Tensor, "3 S S"] | None
+
+
+@dataclass
+class Memory:
+    """What a guide remembers between two steps: all of it goes into checkpoints."""
+
+    coverage: Float[Tensor, "N"] | None = None
+    """Of the current Gaussians; None when they have changed."""
+    mean_u: Float[Tensor, "C"] | None = None
+    """Mean uncertainty of every candidate camera, as old as `coverage`."""
+    coverage_step: int = 0
+    targets: dict[int, Tensor] = field(default_factory=dict)
+    """recon: uint8 [3, S, S] per candidate."""
+    target_steps: dict[int, int] = field(default_factory=dict)
+
+
+class Guide:
+    """Holds a prior, what the expert knows, and the cameras to look from. Its steps depend on nothing but their number,
+    the Gaussians and `Memory`, so that a resumed run has the same bits."""
+
+    def __init__(
+        self,
+        prior: Prior,
+        conditioning: Conditioning,
+        config: GuidanceConfig,
+        scene: Scene,
+        backend: Backend,
+        *,
+        weight: float,
+        front: Cameras,
+        iterations: int,
+        seed: int,
+        background: Float[Tensor, "3"] | None,
+        warn: Warn,
+    ) -> None:
+        """`weight` is lambda after the guard; `front` the camera whose side is the front; `background` None draws a
+        color per step, as the training does."""
+        self.prior, self.conditioning, self.config, self.backend = prior, conditioning, config, backend
+        self.weight, self.iterations, self.seed, self.background = weight, iterations, seed, background
+        self.warn = warn
+        self.inputs = [view.camera for view in scene.train]
+        self.rig = make_rig(self.inputs, scene.extent, prior.size, front)
+        self.references = square_views(scene.train, prior.size, torch.ones(3) if background is None else background)
+        self.counts = Counts()
+        self.memory = Memory()
+        self.sample: Sample | None = None
+        """The last guided step."""
+
+    def gradients(self, step: int, gaussians: Gaussians, settings: RasterSettings) -> Gradients | None:
+        """Gradients of lambda times the guidance loss, or None for a step without guidance."""
+        if self.weight == 0 or self.counts.ended or not schedule.is_guided(step, self.config, self.iterations):
+            return None
+        self._look_around(step, gaussians)
+        assert self.memory.mean_u is not None
+        index = draw_candidate(self.memory.mean_u, self.config.min_uncertainty, self._random(step, 0, "camera"))
+        if index is None:
+            self.counts.decided += 1
+            return None
+        try:
+            gradients = self._guided(step, index, gaussians, settings)
+        except (NumericalError, torch.OutOfMemoryError) as error:
+            self._fail(step, error)
+            return None
+        self.counts.guided += 1
+        self.counts.failed_in_a_row = 0
+        return gradients
+
+    def forget(self) -> None:
+        """Gaussians came, went or changed places: their coverage is no longer known."""
+        self.memory.coverage = None
+
+    def _look_around(self, step: int, gaussians: Gaussians) -> None:
+        """Coverage of the Gaussians, and how uncertain each candidate camera's view is."""
+        memory = self.memory
+        if memory.coverage is not None and step - memory.coverage_step < COVERAGE_EVERY:
+            return
+        memory.coverage = coverage.coverage(gaussians, self.inputs, self.backend)
+        memory.mean_u = self.mean_uncertainty(gaussians, memory.coverage)
+        memory.coverage_step = step
+
+    def mean_uncertainty(self, gaussians: Gaussians, covered: Float[Tensor, "N"]) -> Float[Tensor, "C"]:
+        """Of every candidate's view, at a low resolution."""
+        small = self.rig.candidates.resized(32, 32)
+        return coverage.mean_uncertainty(gaussians, coverage.uncertainty(covered), small, self.backend)
+
+    def _guided(self, step: int, index: int, gaussians: Gaussians, settings: RasterSettings) -> Gradients:
+        """Render, ask, and carry the answer back to the parameters."""
+        assert self.memory.coverage is not None
+        moved = None if self.config.policy == "recon" else self._random(step, index, "jitter")
+        camera = self.rig.camera(index, moved)
+        frame = self.backend.forward(gaussians, camera, settings, self._background(step))
+        u = coverage.uncertainty(self.memory.coverage)
+        weights = coverage.uncertainty_map(gaussians, u, camera, self.backend)
+        images = frame.colors.detach().permute(2, 0, 1)[None]
+        v_images = self.weight * self.pull(step, index, camera, images, frame.alphas.detach(), weights)
+        if not bool(torch.isfinite(v_images).all()):
+            raise NumericalError(
+                f"The gradient of the guidance in step {step} is not finite. Choose --guidance.dtype float32."
+            )
+        gradients = self.backend.backward(frame, v_images[0].permute(1, 2, 0).contiguous())
+        for name in GEOMETRY:
+            getattr(gradients, name).mul_(self.config.geometry)
+        return gradients
+
+    def pull(
+        self,
+        step: int,
+        index: int,
+        camera: Cameras,
+        images: Images,
+        alphas: Float[Tensor, "S S"],
+        weights: Float[Tensor, "S S"],
+    ) -> Images:
+        """dL/d(images) of the policy's loss, lambda left out."""
+        if self.config.policy == "recon":
+            target = self._target(step, index, camera, images, alphas)
+            g = policies.pixel_pull(images, target)
+            self._remember(step, index, "", images, weights, None, target[0])
+            return 2 * weights * g / g.numel()  # z = 2x - 1
+        with torch.enable_grad():
+            leaf = images.clone().requires_grad_()
+            z = self.prior.encode(leaf)
+        drawn, look = self._look(step, index, camera, images, alphas, z)
+        if self.config.policy == "sdi":
+            pull = policies.sdi(self.prior, z, look, self.config.inversion_steps)
+        else:
+            pull = policies.sds(self.prior, z, look)
+        self._remember(step, index, drawn, images, weights, pull.x0, None)
+        # Divided by numel only after the encoder's backward pass: half precision would lose so small a gradient.
+        (v_images,) = torch.autograd.grad(z, leaf, policies.resized(weights, z) * pull.g)
+        return v_images / z.numel()
+
+    def _target(self, step: int, index: int, camera: Cameras, images: Images, alphas: Float[Tensor, "S S"]) -> Images:
+        """recon's target for a candidate: denoised anew when it is too old, rounded to what a checkpoint keeps."""
+        memory = self.memory
+        if index not in memory.targets or step - memory.target_steps[index] >= self.config.refresh_every:
+            with torch.no_grad():
+                z = self.prior.encode(images)
+                _, look = self._look(step, index, camera, images, alphas, z)
+                target = self.prior.decode(policies.denoised(self.prior, z, look, self.config.denoise_steps))
+            if not bool(torch.isfinite(target).all()):
+                raise NumericalError(
+                    f"The decoded target of step {step} is not finite. Choose --guidance.dtype float32."
+                )
+            memory.targets[index] = (target[0].cpu().clamp(0, 1) * 255).round().to(torch.uint8)
+            memory.target_steps[index] = step
+        return memory.targets[index][None].float() / 255
+
+    def _look(
+        self, step: int, index: int, camera: Cameras, images: Images, alphas: Float[Tensor, "S S"], z: Latents
+    ) -> tuple[str, policies.Look]:
+        """This step's noise level, noise and conditions, and the text among the latter."""
+        random = self._random(step, index, "noise")
+        least, most = schedule.noise_range(step, self.config, self.iterations)
+        share = least + (most - least) * float(torch.rand(1, generator=random, dtype=torch.float64))
+        side = self.rig.side(camera, self._front_known())
+        drawn = self.conditioning.draw(side, self._random(step, index, "prompt"))
+        positive = Condition(
+            tokens=drawn.positive,
+            class_embedding=drawn.class_embedding,
+            render=torch.cat([images[0].clamp(0, 1), alphas[None]]),
+            camera=camera,
+            references=nearest(self.references, camera, self.config.references),
+        )
+        negative = replace(positive, tokens=drawn.negative, class_embedding=None, references=None)
+        return drawn.text, policies.Look(
+            t=self.prior.schedule.step(share),
+            eps=torch.randn(z.shape, generator=random).to(z),
+            pair=Pair(positive, negative),
+            scale=Scale(self.config.guidance_scale, self.config.rescale, self.config.sequential),
+            weighting=self.config.weighting,
+            clip_rms=self.config.clip_rms,
+        )
+
+    def _front_known(self) -> bool:
+        """Sides are named where the user named the front, or wrote prompts for sides."""
+        return self.config.front_view is not None or any(
+            p.view not in ("all", "top") for p in self.conditioning.prompts
+        )
+
+    def _background(self, step: int) -> Float[Tensor, "3"]:
+        if self.background is not None:
+            return self.background
+        return torch.rand(3, generator=self._random(step, 0, "background"))
+
+    def _random(self, step: int, view: int, purpose: str) -> torch.Generator:
+        return generator(self.seed, step, view, purpose)
+
+    def _fail(self, step: int, error: Exception) -> None:
+        counts = self.counts
+        counts.failed += 1
+        counts.failed_in_a_row += 1
+        counts.ended = counts.failed_in_a_row >= MOST_FAILURES
+        end = f" That was failure {MOST_FAILURES} in a row: the run goes on without guidance." if counts.ended else ""
+        self.warn(f"Step {step} is not guided: {error}{end}")
+
+    def _remember(
+        self,
+        step: int,
+        index: int,
+        text: str,
+        images: Images,
+        weights: Float[Tensor, "S S"],
+        x0: Latents | None,
+        target: Float[Tensor, "3 S S"] | None,
+    ) -> None:
+        self.sample = Sample(step, index, text, images[0], weights, x0, target)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """All that the next guided step depends on beside the Gaussians: tensors, and what JSON can hold."""
+        memory = self.memory
+        tensors = {f"target.{index}": target for index, target in memory.targets.items()}
+        tensors |= {name: tensor for name in ("coverage", "mean_u") if (tensor := getattr(memory, name)) is not None}
+        meta = {
+            "counts": asdict(self.counts),
+            "coverage_step": memory.coverage_step,
+            "target_steps": {str(index): step for index, step in memory.target_steps.items()},
+        }
+        return tensors, meta
+
+    def restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
+        """Inverse of `state`."""
+        self.counts = Counts(**{item.name: meta["counts"][item.name] for item in fields(Counts)})
+        self.memory = Memory(
+            coverage=tensors.get("coverage"),
+            mean_u=tensors.get("mean_u"),
+            coverage_step=int(meta["coverage_step"]),
+            targets={int(k.removeprefix("target.")): v for k, v in tensors.items() if k.startswith("target.")},
+            target_steps={int(index): int(step) for index, step in meta["target_steps"].items()},
+        )

@@ -1,0 +1,127 @@
+"""What a prior's opinion becomes: a target for the render, and a loss whose gradient is known in closed form.
+
+    (1)  L = 1/2 mean( u (z - sg[z - g])^2 )          so that dL/dz = u g / numel,   sg: no gradient passes
+
+z is the render in the prior's space, u the weight of every pixel. The mean (not the sum) makes lambda independent of
+the resolution. g depends on the policy:
+
+    sds    g = w(t) (eps_hat - eps) = w(t) sqrt(a/(1-a)) (z - x0_hat)                (Poole et al. 2022, eq. 3)
+    sdi    the same, with the noise that DDIM inversion finds for z                    (Lukoianov et al. 2024)
+    recon  g = z - target in pixels, the target denoised from z_t in several steps    (Zhou & Tulsiani 2023)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.sds.noise import Latents, Signal, add_noise, eps_from, weight
+from gsopt.sds.prior import Images, Pair, Prior, Scale, guided_x0
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one guided step looks at its render: its random numbers, and the settings that matter to it."""
+
+    t: int
+    eps: Latents
+    pair: Pair
+    scale: Scale
+    weighting: str = "sigma2"
+    clip_rms: float = 0.0
+    """Largest root mean square of g; 0 = any."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Where the prior wants the render to go."""
+
+    g: Latents
+    """dL/dz times numel, before the pixel weights."""
+    x0: Latents
+    """The prior's estimate of the clean image."""
+
+
+def sds(prior: Prior, z: Latents, look: Look) -> Pull:
+    """Score distillation from one noisy copy of `z`."""
+    z = z.detach()
+    return _distilled(prior, z, add_noise(z, look.eps, _signal(prior, look.t, z)), look)
+
+
+def sdi(prior: Prior, z: Latents, look: Look, steps: int) -> Pull:
+    """Score distillation whose noise belongs to `z`: nothing random but t, less variance, `steps` more calls."""
+    z = z.detach()
+    return _distilled(prior, z, inverted(prior, z, look, steps), look)
+
+
+def _distilled(prior: Prior, z: Latents, x_t: Latents, look: Look) -> Pull:
+    """g from the noisy copy; x_t fixes the noise, so eps_hat - eps = sqrt(a/(1-a)) (z - x0_hat)."""
+    signal = _signal(prior, look.t, z)
+    x0 = guided_x0(prior, x_t, look.t, look.pair, look.scale)
+    g = weight(look.weighting, signal) * (signal / (1 - signal)).sqrt() * (z - x0)
+    return Pull(clipped(g, look.clip_rms), x0)
+
+
+@torch.no_grad()
+def inverted(prior: Prior, z: Latents, look: Look, steps: int) -> Latents:
+    """x_t that deterministic DDIM (Song et al. 2021, eq. 12) would bring back to `z`: its steps taken backwards.
+
+    The noise between s and t > s is asked for at t, where the network is better conditioned. Unconditional, as the
+    inversion of ISM (Liang et al. 2024).
+    """
+    plain = Scale(0.0, 0.0, look.scale.sequential)
+    x, here = z, torch.ones_like(_signal(prior, 0, z))
+    for t in times(look.t, steps)[::-1]:
+        there = _signal(prior, t, z)
+        eps = eps_from(guided_x0(prior, x, t, look.pair, plain), x, there)
+        x0 = (x - (1 - here).sqrt() * eps) / here.sqrt()
+        x, here = add_noise(x0, eps, there), there
+    return x
+
+
+@torch.no_grad()
+def denoised(prior: Prior, z: Latents, look: Look, steps: int) -> Latents:
+    """`z` noised to t and brought back by `steps` DDIM steps (SDEdit, Meng et al. 2022)."""
+    x = add_noise(z.detach(), look.eps, _signal(prior, look.t, z))
+    descending = times(look.t, steps)
+    for t, after in zip(descending, [*descending[1:], None], strict=True):
+        x0 = guided_x0(prior, x, t, look.pair, look.scale)
+        if after is None:
+            break
+        x = add_noise(x0, eps_from(x0, x, _signal(prior, t, z)), _signal(prior, after, z))
+    return x0
+
+
+def times(t: int, steps: int) -> list[int]:
+    """At most `steps` distinct steps from t down, evenly spaced, the last one above 0 where there is room."""
+    return list(dict.fromkeys(max(1, round(t * (steps - i) / steps)) for i in range(steps)))
+
+
+def loss(z: Latents, g: Latents, weights: Float[Tensor, "B 1 h w"]) -> Float[Tensor, ""]:
+    """Equation (1)."""
+    target = (z - g).detach()
+    return 0.5 * (weights * (z - target).square()).mean()
+
+
+def pixel_pull(images: Images, target: Images) -> Latents:
+    """g of recon, on pixels in [-1, 1] as the network's own scale."""
+    return 2 * (images.detach() - target)
+
+
+def resized(weights: Float[Tensor, "S S"], z: Latents) -> Float[Tensor, "1 1 h w"]:
+    """Pixel weights averaged over what each latent covers."""
+    return torch.nn.functional.adaptive_avg_pool2d(weights[None, None], z.shape[2:]).to(z)
+
+
+def clipped(g: Latents, rms: float) -> Latents:
+    """g, shortened where its root mean square exceeds `rms`."""
+    if rms == 0:
+        return g
+    return g * (rms / g.square().mean().sqrt().clamp_min(1e-12)).clamp(max=1)
+
+
+def _signal(prior: Prior, t: int, like: Tensor) -> Signal:
+    return prior.schedule.signal(torch.tensor([t]), like)

@@ -1,0 +1,131 @@
+"""The guard: short runs without one input view say whether guidance helps there, before the run itself is guided.
+
+A view the model has learned from cannot tell: any prior only blurs what is known. So every view that is left out gets
+models that never saw it, first Gaussians included: one without guidance and one with, the same in all else. Where
+guidance lowers the mean PSNR of the left-out views its weight is halved and tried again; after three trials it is 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from gsopt.cameras import Cameras
+from gsopt.config import InitConfig, ScheduleConfig, TrainConfig
+from gsopt.data.scene import Scene, View
+from gsopt.data.split import farthest_points
+from gsopt.init import first_gaussians
+from gsopt.metrics import psnr
+from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.sds.conditioning import Conditioning
+from gsopt.sds.guidance import Warn
+from gsopt.sds.prior import Prior
+from gsopt.training import schedule
+from gsopt.training.guidance import RunGuidance, make_guide
+from gsopt.training.targets import Targets
+from gsopt.training.trainer import Trainer
+
+FACTORS = (1.0, 0.5, 0.25)
+SIDE = 128
+"""Longer side of the images of a short run, px, as near as halving comes."""
+GAUSSIANS = 5000
+WHITE = torch.ones(3)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the guard found."""
+
+    factor: float
+    """On lambda."""
+    reason: str
+    trials: list[dict[str, Any]]
+    """Per trial: factor, and mean PSNR of the left-out views with and without guidance, dB."""
+
+
+@dataclass(frozen=True)
+class Left:
+    """One input view left out."""
+
+    scene: Scene
+    """Without it."""
+    view: View
+    plain: float
+    """Its PSNR without guidance, dB."""
+
+
+def judge_guidance(
+    config: TrainConfig,
+    scene: Scene,
+    backend: Backend,
+    prior: Prior,
+    conditioning: Conditioning,
+    weight: float,
+    front: Cameras,
+    warn: Warn,
+) -> Verdict:
+    """The largest factor on `weight` for which guidance does not lower the PSNR of input views that were left out."""
+    guidance = config.guidance
+    if guidance.guard_views == 0:
+        return Verdict(1.0, "not checked: --guidance.guard-views is 0", [])
+    if len(scene.train) < 2:
+        return Verdict(1.0, "not checked: there is only one input view", [])
+    short = short_config(config, scene)
+    centers = torch.cat([view.camera.centers for view in scene.train])
+    left_out = sorted(farthest_points(centers, min(guidance.guard_views, len(scene.train))))
+    lefts = [_left(short, scene, index, backend) for index in left_out]
+    trials = []
+    for factor in FACTORS:
+        made = [_psnr(short, left, backend, (prior, conditioning, factor * weight, front, warn)) for left in lefts]
+        plain, guided = (sum(values) / len(lefts) for values in ([left.plain for left in lefts], made))
+        trials.append({"factor": factor, "plain": round(plain, 4), "guided": round(guided, 4)})
+        if guided >= plain:
+            names = ", ".join(left.view.name for left in lefts)
+            return Verdict(factor, f"{guided - plain:+.2f} dB on {names} when left out", trials)
+    return Verdict(0.0, "guidance made every left-out view worse, at a quarter of its weight too", trials)
+
+
+def short_config(config: TrainConfig, scene: Scene) -> TrainConfig:
+    """A small copy of the run: few steps on small images, few Gaussians, no density control, guided as the run is."""
+    steps = config.guidance.guard_steps
+    longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
+    halvings = min(6, max(0, round(math.log2(longest / SIDE))))
+    guidance = replace(config.guidance, every=min(config.guidance.every, max(1, steps // 24)))
+    return replace(
+        config,
+        iterations=steps,
+        init=InitConfig(config.init.method, min(GAUSSIANS, config.init.count)),
+        density=replace(config.density, refine_start=steps, refine_stop=steps),
+        # Downscaled by 2 for every entry that no step passes.
+        schedule=ScheduleConfig(coarse_until=tuple(steps + i for i in range(halvings))),
+        guidance=guidance,
+        checkpoint_every=0,
+        preview_every=0,
+    )
+
+
+def _left(config: TrainConfig, scene: Scene, index: int, backend: Backend) -> Left:
+    others = tuple(view for i, view in enumerate(scene.train) if i != index)
+    left = Left(replace(scene, train=others), scene.train[index], 0.0)
+    return replace(left, plain=_psnr(config, left, backend, None))
+
+
+def _psnr(
+    config: TrainConfig, left: Left, backend: Backend, guide: tuple[Prior, Conditioning, float, Cameras, Warn] | None
+) -> float:
+    """Of the left-out view after a short run on the others, dB."""
+    degree = schedule.max_sh_degree(config, len(left.scene.train))
+    gaussians, _ = first_gaussians(left.scene, config.init, degree, config.seed)
+    guidance = None
+    if guide is not None:
+        guidance = RunGuidance(make_guide(config, left.scene, backend, *guide))
+    trainer = Trainer(config, left.scene, gaussians, backend, guidance)
+    while trainer.step < config.iterations:
+        trainer.advance()
+    target = Targets([left.view], WHITE, 0).get(0, schedule.downscale(1, config.schedule.coarse_until or ()), WHITE)
+    settings = RasterSettings(sh_degree=degree, antialiased=config.antialiased)
+    colors = backend.forward(trainer.model.gaussians, target.camera, settings, WHITE).colors
+    return min(100.0, float(psnr(colors.clamp(0, 1)[None], target.colors[None])))
