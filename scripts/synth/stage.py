@@ -14,7 +14,7 @@ from gsopt.errors import InputError
 from synth.meshfile import check_mesh, find_near
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 Y_UP = (".obj", ".glb", ".gltf")
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -106,27 +106,56 @@ def mend_textures(bpy: Any, mesh: Path) -> list[str]:
 
 
 def mend_normals(shape: Any, unshaded: bool) -> list[str]:
-    """Corner normals that point away from their face would shade black: they are computed anew.
+    """Normals that would shade black are computed anew; what was done, for the record.
 
-    A mesh of a kind without shading of its own and without normals becomes smooth where faces meet below 30 degrees.
+    Neighbors that wind opposite ways (ShapeNet stores faces from both sides, importers keep one at random) are turned
+    alike, and what normals the mesh had are dropped. So they are, corner by corner, where they point away from their
+    face. A mesh of a kind without shading of its own and without normals becomes smooth where faces meet gently.
     """
-    if not len(shape.polygons):
-        return []
+    corners = integers(shape.loops, "vertex_index")
+    sizes = integers(shape.polygons, "loop_total")
+    turned = winding_disagrees(corners, sizes)
+    if turned:
+        wind_alike(shape)
+    if turned or (unshaded and not shape.has_custom_normals):
+        if shape.has_custom_normals:
+            shape.normals_split_custom_set(np.zeros((len(shape.loops), 3)).tolist())  # zero stands for "compute it"
+        shape.polygons.foreach_set("use_smooth", np.ones(len(shape.polygons), bool))
+        shape.set_sharp_from_angle(angle=SMOOTH_BELOW)
+        return ["faces wound both ways: turned alike, normals computed anew"] if turned else []
     if not shape.has_custom_normals:
-        if unshaded:
-            shape.polygons.foreach_set("use_smooth", np.ones(len(shape.polygons), bool))
-            shape.set_sharp_from_angle(angle=SMOOTH_BELOW)
         return []
-    corners = vectors(shape.corner_normals, "vector")
-    sizes = np.empty(len(shape.polygons), np.int32)
-    shape.polygons.foreach_get("loop_total", sizes)
+    normals = vectors(shape.corner_normals, "vector")
     faces = np.repeat(vectors(shape.polygon_normals, "vector"), sizes, axis=0)
-    wrong = ~((corners * faces).sum(axis=1) > 0.0) & (np.linalg.norm(faces, axis=1) > 0.5)
+    wrong = ~((normals * faces).sum(axis=1) > 0.0) & (np.linalg.norm(faces, axis=1) > 0.5)
     if not wrong.any():
         return []
-    corners[wrong] = 0.0  # zero stands for "compute it"
-    shape.normals_split_custom_set(corners.tolist())
+    normals[wrong] = 0.0
+    shape.normals_split_custom_set(normals.tolist())
     return [f"{int(wrong.sum())} of {len(wrong)} normals pointed away from their face and were computed anew"]
+
+
+def winding_disagrees(corners: Int[np.ndarray, "L"], sizes: Int[np.ndarray, "F"]) -> bool:
+    """True when the two faces of some edge run along it in the same direction."""
+    ends = np.repeat(np.cumsum(sizes), sizes)
+    following = np.arange(1, len(corners) + 1)
+    following = np.where(following == ends, ends - np.repeat(sizes, sizes), following)  # the last meets the first
+    edges = np.stack([corners, corners[following]], axis=1).astype(np.int64)
+    forward = edges[:, 0] < edges[:, 1]
+    _, edge, faces = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    balance = np.bincount(edge.ravel(), np.where(forward, 1.0, -1.0), len(faces))
+    return bool(((faces == 2) & (balance != 0)).any())
+
+
+def wind_alike(shape: Any) -> None:
+    """Turn the faces of every connected part the same way, outward as far as there is an outside."""
+    import bmesh
+
+    editable = bmesh.new()
+    editable.from_mesh(shape)
+    bmesh.ops.recalc_face_normals(editable, faces=editable.faces)
+    editable.to_mesh(shape)
+    editable.free()
 
 
 def plain_material(bpy: Any, shape: Any) -> Any:
@@ -162,6 +191,13 @@ def solid_triangles(bpy: Any) -> Iterator[Float[np.ndarray, "T 3 3"]]:
         world = np.array(instance.matrix_world, np.float64)
         yield (vectors(shape.vertices, "co") @ world[:3, :3].T + world[:3, 3])[corners].reshape(-1, 3, 3)
         solid.to_mesh_clear()
+
+
+def integers(rows: Any, name: str) -> Int[np.ndarray, "N"]:
+    """A whole-number property of every row of a Blender collection."""
+    values = np.empty(len(rows), np.int32)
+    rows.foreach_get(name, values)
+    return values
 
 
 def vectors(rows: Any, name: str) -> Float[np.ndarray, "N 3"]:
