@@ -108,6 +108,11 @@ struct AdamArguments {
   float step_size, beta1, beta2, inv_sqrt_correction2, eps;
 };
 
+// What one core can do at best, lanes per second: fused multiply-adds, and exponentials.
+struct Calibration {
+  double fma, exp;
+};
+
 // The kernels of one instruction set.
 struct Kernels {
   const char* name;
@@ -118,6 +123,7 @@ struct Kernels {
   void (*project_backward)(Pool&, Frame&, const Parameters&, const ParameterGradients&);
   void (*photometric)(Pool&, PhotometricArguments&);
   void (*adam)(Pool&, const AdamArguments&);
+  Calibration (*calibrate)();
 };
 
 }  // namespace gsopt

@@ -7,6 +7,7 @@
 #include "bin.h"
 #include "blend.h"
 #include "blend_backward.h"
+#include "calibrate.h"
 #include "photometric.h"
 #include "project.h"
 
@@ -18,7 +19,7 @@ namespace gsopt::GSOPT_ISA {
 extern const Kernels kernels;
 const Kernels kernels = {
     GSOPT_STRING(GSOPT_ISA), project_stage, bin_stage, blend_stage, blend_backward_stage, project_backward_stage,
-    photometric_stage,       adam_stage,
+    photometric_stage,       adam_stage,    calibrate,
 };
 
 }  // namespace gsopt::GSOPT_ISA

@@ -10,6 +10,7 @@
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
+#include <ctime>
 #include <map>
 #include <memory>
 #include <stdexcept>
@@ -70,13 +71,16 @@ struct Workspace {
   bool count_work = false;
   Work work;                              // summed over frames while count_work is set
   std::map<std::string, double> seconds;  // wall time per stage since construction
+  std::map<std::string, double> cpu_seconds;  // the same in CPU time of the whole process
   Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) {}
 };
 
 template <class Stage> void timed(Workspace& ws, const char* name, Stage&& stage) {
   const auto start = std::chrono::steady_clock::now();
+  const std::clock_t cpu_start = std::clock();
   stage();
   ws.seconds[name] += std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  ws.cpu_seconds[name] += static_cast<double>(std::clock() - cpu_start) / CLOCKS_PER_SEC;
 }
 
 template <class Array> auto* data_of(const Array& a, size_t size, const char* name) {
@@ -215,6 +219,8 @@ NB_MODULE(_cpu, m) {
       .def(nb::init<int, const std::string&>(), nb::arg("threads"), nb::arg("isa"))
       .def_prop_ro("isa", [](const Workspace& w) { return std::string(w.kernels->name); })
       .def_ro("seconds", &Workspace::seconds)
+      .def_ro("cpu_seconds", &Workspace::cpu_seconds)
+      .def("calibrate", [](const Workspace& w) { const Calibration c = w.kernels->calibrate(); return std::tuple(c.fma, c.exp); })
       .def_rw("count_work", &Workspace::count_work)
       .def_prop_ro("work", [](const Workspace& w) { return std::tuple(w.work.entries, w.work.pairs); })
       .def_prop_ro("threads", [](const Workspace& w) { return w.pool.threads(); });
