@@ -5,27 +5,39 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
 
 import numpy as np
 from jaxtyping import Float
 
 from gsopt.data.sfm.features import ViewGraph
-from gsopt.data.sfm.photos import Photo, Refused
+from gsopt.data.sfm.photos import Photo, Refused, natural
 
 BLURRED = 0.25
 """Share of the set's median sharpness below which a photo counts as blurred."""
 FEW_FEATURES = 200
 WEAK = 30
 """Features in common below which a pair cannot carry a pose."""
+PLAIN = 4.0
+"""Grey levels a picture must vary by before lack of detail can be blur."""
 WIDE_GAP = 35.0
 """Degrees between neighboring viewing directions above which more photos are advised."""
+REASONS = {
+    "blurred": "blurred",
+    "featureless": "too few features to hold on to",
+    "alone": "nothing to compare it with",
+    "pair": "two photos that match, and no third to confirm where they stood",
+    "unmatched": "no match: nothing in it is found again in another photo",
+    "still": "no depth: it differs from its matches by a turn on the spot, or shows one plane",
+    "apart": "matches only photos outside the scene",
+    "weak": "its matches are too weak or do not agree with the others",
+}
 REMEDIES = {
     "blurred": "Take the blurred ones again with a steadier hand or more light.",
     "featureless": "Plain or glossy surfaces give no features: put something patterned (newspaper) around the object.",
     "unmatched": "Take photos so that each shares two thirds of its picture with the one before.",
-    "apart": "Photos of different things or places do not belong into one folder: run each group on its own.",
     "still": "Turning on the spot gives no depth: walk around the object instead.",
+    "apart": "Photos of different things or places do not belong into one folder: run each group on its own.",
+    "weak": "Take more photos between those that match weakly, each sharing two thirds of its picture with the next.",
 }
 
 
@@ -34,9 +46,11 @@ class Left:
     """A photo without a pose."""
 
     name: str
-    reason: str
     kind: str
-    """A key of REMEDIES, or "refused"."""
+    """A key of REASONS, or "refused"."""
+    reason: str
+    detail: str = ""
+    """Figures of this photo."""
 
 
 @dataclass
@@ -68,9 +82,10 @@ class Diagnosis:
     def lines(self) -> list[str]:
         """The whole report as text: headline, photos by reason, advice."""
         lines = [self.headline()]
-        by_reason = sorted(self.left, key=lambda left: left.reason)
-        for reason, group in groupby(by_reason, key=lambda left: left.reason):
-            lines.append(f"  not placed: {_names([left.name for left in group])}: {reason}")
+        by_reason: dict[str, list[str]] = {}
+        for left in self.left:
+            by_reason.setdefault(left.reason, []).append(f"{left.name} ({left.detail})" if left.detail else left.name)
+        lines += [f"  not placed: {_listed(names)}: {reason}" for reason, names in by_reason.items()]
         return lines + [f"  advice: {text}" for text in self.advice]
 
 
@@ -78,12 +93,12 @@ def explain(
     photos: Sequence[Photo], refused: Sequence[Refused], graph: ViewGraph | None, registered: set[str]
 ) -> Diagnosis:
     """Reasons for every file without a pose, and advice that follows from them."""
-    left = [Left(item.name, item.reason, "refused") for item in refused]
+    left = [Left(item.name, "refused", item.reason) for item in refused]
     usual = statistics.median(photo.sharpness for photo in photos) if photos else 0.0
     for photo in photos:
         if photo.name not in registered:
-            kind, reason = why_left(photo, graph, registered, usual)
-            left.append(Left(photo.name, reason, kind))
+            kind, detail = why_left(photo, graph, registered, usual)
+            left.append(Left(photo.name, kind, REASONS[kind], detail))
     names = [photo.name for photo in photos if photo.name in registered]
     diagnosis = Diagnosis(len(photos) + len(refused), names, left)
     diagnosis.advice += gaps([photo.name for photo in photos], registered)
@@ -93,27 +108,26 @@ def explain(
 
 
 def why_left(photo: Photo, graph: ViewGraph | None, registered: set[str], usual: float) -> tuple[str, str]:
-    """(kind, reason) for a photo that was read but has no pose."""
-    blurred = photo.sharpness < BLURRED * usual
-    blur = f"blurred: sharpness {photo.sharpness:.3f}, usual here is {usual:.3f}"
+    """(kind, figures) of a photo that was read but has no pose."""
     if graph is None:
-        return "unmatched", "nothing to compare it with"
-    features = graph.features.get(photo.name, 0)
-    partners = graph.partners(photo.name)
-    if blurred and (features < FEW_FEATURES or sum(partners.values()) < WEAK):
-        return "blurred", blur
-    if features < FEW_FEATURES:
-        return "featureless", f"only {features} features: little to hold on to in it"
+        return "alone", ""
+    features, partners = graph.features.get(photo.name, 0), graph.partners(photo.name)
+    few = features < FEW_FEATURES
+    if photo.sharpness < BLURRED * usual and photo.contrast > PLAIN and (few or sum(partners.values()) < WEAK):
+        return "blurred", f"sharpness {photo.sharpness:.3f}, usual is {usual:.3f}"
+    if few:
+        return "featureless", f"{features} features"
     if not partners:
-        return "unmatched", f"no match: none of its {features:,} features is found again in another photo"
-    if all((min(photo.name, other), max(photo.name, other)) in _ordered(graph.still) for other in partners):
-        return "still", "no depth: it differs from its matches only by a turn or shows one plane"
+        return "unmatched", f"{features:,} features"
+    if all(graph.is_still(photo.name, other) for other in partners):
+        return "still", ""
     if registered and not registered & set(partners):
-        return "apart", f"matches only photos outside the scene, best {_best(partners)}"
+        return "apart", ""
+    if len(graph.features) == 2:
+        return "pair", ""
     known = {name: count for name, count in partners.items() if name in registered} or partners
-    return (
-        ("blurred", f"{blur}; best match {_best(known)}") if blurred else ("unmatched", f"weak match: {_best(known)}")
-    )
+    name, count = next(iter(known.items()))
+    return "weak", f"best: {count} features in common with {name}"
 
 
 def gaps(names: Sequence[str], registered: set[str]) -> list[str]:
@@ -149,21 +163,12 @@ def split_groups(graph: ViewGraph, registered: set[str]) -> list[str]:
     """Photos that match each other but nothing in the scene: another object or place in the same folder."""
     others = [group for group in graph.groups() if len(group) > 2 and not group & registered]
     return [
-        f"{len(group)} photos match only each other ({_names(sorted(group))}): another object or place? "
+        f"{len(group)} photos match only each other ({_listed(sorted(group, key=natural))}): another object or place? "
         "Run them on their own."
         for group in others
     ]
 
 
-def _ordered(pairs: frozenset[tuple[str, str]]) -> set[tuple[str, str]]:
-    return {(min(pair), max(pair)) for pair in pairs}
-
-
-def _best(partners: dict[str, int]) -> str:
-    name, count = next(iter(partners.items()))
-    return f"{count} features in common with {name}"
-
-
-def _names(names: Sequence[str], most: int = 6) -> str:
+def _listed(names: Sequence[str], most: int = 6) -> str:
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -42,6 +42,10 @@ class ViewGraph:
         found = {b if a == name else a: n for (a, b), n in self.inliers.items() if name in (a, b)}
         return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
 
+    def is_still(self, a: str, b: str) -> bool:
+        """Whether the pair alone carries no depth."""
+        return (a, b) in self.still or (b, a) in self.still
+
     def groups(self) -> list[set[str]]:
         """Photos connected by matches, largest group first; a photo without a match is a group of its own."""
         group = {name: {name} for name in self.features}

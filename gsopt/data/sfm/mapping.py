@@ -19,6 +19,8 @@ INCREMENTAL_UP_TO = 300
 SATISFIED = 0.9
 """Share of the photos below which `auto` tries the other mapper."""
 SMALLEST_MODEL = 3
+FEWEST_POINTS = 15
+"""Points a photo must see for its pose to count."""
 ENOUGH_FOR_CENTER = 10
 """Photos of one camera from which on the last adjustment may move its principal point."""
 
@@ -64,10 +66,11 @@ def find_poses(
             best = mapped
         if len(best.names) >= SATISFIED * count:
             break
-    if best is None or len(best.names) < SMALLEST_MODEL:
+    if best is None:
         return None
     adjust(pycolmap, best.reconstruction, config)
-    return best
+    drop_unsupported(best.reconstruction)
+    return best if len(best.names) >= SMALLEST_MODEL else None
 
 
 def mappers_to_try(config: SfmConfig, count: int) -> list[str]:
@@ -101,9 +104,20 @@ def adjust(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> None
     options.refine_principal_point = reconstruction.num_reg_images() >= ENOUGH_FOR_CENTER * len(reconstruction.cameras)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(reconstruction, options)
+    everything = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        everything.add_image(image_id)
+    everything.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, everything, reconstruction).solve()
     pycolmap.ObservationManager(reconstruction).filter_all_points3D(4.0, 1.5)
     reconstruction.update_point_3d_errors()
+
+
+def drop_unsupported(reconstruction: Any) -> None:
+    """Take back the poses of photos that see too few points: a pose must be held by something."""
+    weak = [i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D < FEWEST_POINTS]
+    for image_id in weak:
+        reconstruction.deregister_frame(reconstruction.image(image_id).frame_id)
 
 
 def incremental_options(pycolmap: ModuleType, config: SfmConfig) -> Any:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from gsopt.data import files
 from gsopt.data.images import MAX_PIXELS
@@ -49,6 +49,12 @@ class Photo:
     sharpness: float
     has_alpha: bool
     thumbnail: Float32[np.ndarray, "32 32"]
+    """Grey levels, 0..255."""
+
+    @property
+    def contrast(self) -> float:
+        """Standard deviation of the thumbnail."""
+        return float(self.thumbnail.std())
 
 
 @dataclass(frozen=True)
@@ -186,6 +192,8 @@ def _opened(path: Path) -> Image.Image:
         raise InputError("is empty (0 bytes). Copy it again from the camera")
     try:
         image = Image.open(path)
+    except UnidentifiedImageError as error:
+        raise InputError("is no image, whatever its name says. Copy it again from the camera") from error
     except Exception as error:
         raise InputError(f"cannot be decoded ({_short(error)}). Copy it again from the camera") from error
     if image.width * image.height > MAX_PIXELS:

@@ -26,7 +26,7 @@ from gsopt.data.sfm import diagnosis, features, mapping, prior
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import Say, ViewGraph
 from gsopt.data.sfm.masks import Masked, prepare_masks
-from gsopt.data.sfm.photos import Photo, Refused, find_photos, read_photos
+from gsopt.data.sfm.photos import Photo, Refused, find_photos, natural, read_photos
 from gsopt.data.sfm.picture import draw_scene
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
@@ -63,7 +63,7 @@ def pose_photos(source: Path, out: Path, config: SfmConfig, say: Say = lambda li
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
     pycolmap = require("pycolmap", "sfm", "Finding camera poses")
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR.value)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # what matters is said by the diagnosis
     with _working_folder(out) as work:
         run = _Run(pycolmap, source, work, config, say)
         scene, report = run.posed()
@@ -92,7 +92,7 @@ class _Run:
         graph, matching = self._graph(photos, masked, frames)
         with self._timed("mapping"):
             mapped = self._mapped(masked, graph, frames)
-        if mapped is None or len(mapped.names) < mapping.SMALLEST_MODEL:
+        if mapped is None:
             raise too_few(diagnosis.explain(photos, refused, graph, set()), graph)
         report = self._diagnose(photos, refused, graph, mapped)
         with self._timed("writing"):
@@ -141,6 +141,8 @@ class _Run:
         return graph, matching
 
     def _mapped(self, masked: Masked, graph: ViewGraph, frames: list[Frame] | None) -> mapping.Mapped | None:
+        if len(graph.features) < mapping.SMALLEST_MODEL:
+            return None
         if frames is None:
             return mapping.find_poses(self.pycolmap, self.database, masked.photos, graph, self.config, self.say)
         found = prior.triangulate(self.pycolmap, self.database, masked.photos, frames, self.config)
@@ -201,7 +203,9 @@ class _Run:
 
 def poses(reconstruction: Any) -> tuple[list[str], Float[np.ndarray, "C 4 4"]]:
     """Names in order and cam_from_world of the registered photos."""
-    images = sorted((reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
+    images = sorted(
+        (reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: natural(image.name)
+    )
     viewmats = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
     return [image.name for image in images], viewmats
 
