@@ -40,7 +40,7 @@ def read_transforms(root: Path) -> Source:
         if held_out is None and files.is_regular(root / name):
             held_out, _ = read_frames(files.read_json(root / name), root / name, warnings)
     if held_out is None and isinstance(document.get("test_filenames"), list):
-        held_out, frames = _pick_test(frames, document["test_filenames"], root)
+        held_out, frames = _pick_test(frames, document, root)
     if not synthetic:
         frames.sort(key=lambda frame: frame.name)
     xyz, rgb = _points(document, root, warnings)
@@ -179,11 +179,17 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
     return Lens(radial=(read("k1"), read("k2"), read("k3"), read("k4")), tangential=tangential, fisheye=fisheye)
 
 
-def _pick_test(frames: list[Frame], names: list[Any], root: Path) -> tuple[list[Frame], list[Frame]]:
-    """(test, rest) by nerfstudio's `test_filenames`."""
-    wanted = {files.relative_name(files.child(root, name), root) for name in names if isinstance(name, str)}
-    test = [frame for frame in frames if frame.name in wanted]
-    return test, [frame for frame in frames if frame.name not in wanted]
+def _pick_test(frames: list[Frame], document: dict[str, Any], root: Path) -> tuple[list[Frame], list[Frame]]:
+    """(test, input) by nerfstudio's `test_filenames`; what `val_filenames` names is neither."""
+
+    def named(key: str) -> set[str]:
+        names = document.get(key)
+        found = names if isinstance(names, list) else []
+        return {files.relative_name(files.child(root, name), root) for name in found if isinstance(name, str)}
+
+    test = named("test_filenames")
+    held_out = test | named("val_filenames")
+    return [f for f in frames if f.name in test], [f for f in frames if f.name not in held_out]
 
 
 def _points(document: dict[str, Any], root: Path, warnings: list[str]) -> tuple[Tensor | None, Tensor | None]:
