@@ -4,7 +4,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 RUN ?=
-TEST_EXTRAS := dev,viewer,video,spz,blender
+TEST_EXTRAS := dev,viewer,video,spz,blender,sfm
 
 VENV := .venv
 PY := $(VENV)/bin/python
