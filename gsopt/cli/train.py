@@ -15,6 +15,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from gsopt import config as settings
 from gsopt.errors import UsageError
 from gsopt.events import to_json, write_atomic
+from gsopt.guidance_config import GuidanceConfig
 
 if TYPE_CHECKING:
     from gsopt.cli.console import RunConsole
@@ -37,7 +38,7 @@ class Density(settings.DensityConfig):
 
 
 @dataclass(frozen=True)
-class Guidance(settings.GuidanceConfig):
+class Guidance(GuidanceConfig):
     """Guidance by a diffusion model where the input views leave the scene open."""
 
     lambda_sds: Annotated[float | None, arg(prefix_name=False, metavar="W")] = None
@@ -213,7 +214,7 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
     )
 
 
-def guidance_config(flags: Guidance) -> settings.GuidanceConfig:
+def guidance_config(flags: Guidance) -> GuidanceConfig:
     """The guidance settings; files and folders that exist are made absolute, texts are read and checked.
 
     Raises InputError for a prompt that cannot be used, UsageError for guidance without a prior: before any work.
@@ -229,7 +230,7 @@ def guidance_config(flags: Guidance) -> settings.GuidanceConfig:
     for name in ("prompts", "prior", "clip", "tiny_vae"):
         values[name] = absolute(values[name])
     values["ref_image"] = tuple(absolute(path) for path in flags.ref_image)
-    config = settings.GuidanceConfig(**values)
+    config = GuidanceConfig(**values)
     choose(config)
     return config
 

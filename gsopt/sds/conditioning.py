@@ -135,8 +135,8 @@ def encode(
     """Everything encoded. `inputs` are views of the scene, `references` the expert's images (either may be empty)."""
     if encoder is None:
         ignored = "The prior takes no words and no reference images: they are not used."
-        notes = (ignored,) if prompts or len(references) else ()
-        return Conditioning("", tuple(prompts), ("",), None, None, None, notes)
+        unused = bool(prompts) or len(references) > 0
+        return Conditioning("", tuple(prompts), ("",), None, None, None, (ignored,) if unused else ())
     texts = tuple(dict.fromkeys(["", *(worded(p, side) for p in prompts for side in _sides(p))]))
     tokens = encoder.texts(texts)
     embeddings = _image_embeddings(encoder, inputs, references)

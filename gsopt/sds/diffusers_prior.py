@@ -31,7 +31,7 @@ LARGE = 1 << 30
 class DiffusersPrior:
     """See `gsopt.sds.prior.Prior`."""
 
-    x0_limit = None
+    x0_limit: float | None = None
     pixel_exact = False
 
     def __init__(self, folder: DiffusersFolder, config: GuidanceConfig) -> None:

@@ -113,7 +113,7 @@ def pixel_pull(images: Images, target: Images) -> Latents:
 
 def resized(weights: Float[Tensor, "S S"], z: Latents) -> Float[Tensor, "1 1 h w"]:
     """Pixel weights averaged over what each latent covers."""
-    return torch.nn.functional.adaptive_avg_pool2d(weights[None, None], z.shape[2:]).to(z)
+    return torch.nn.functional.adaptive_avg_pool2d(weights[None, None], (z.shape[2], z.shape[3])).to(z)
 
 
 def clipped(g: Latents, rms: float) -> Latents:
