@@ -60,7 +60,7 @@ class Flags:
     """Learn Gaussians from the posed images in DATA and write splats, metrics and a report to a run directory."""
 
     data: Annotated[Positional[Path | None], arg(metavar="DATA")] = None
-    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp or COLMAP."""
+    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp or COLMAP; or photos or a video (see gsopt sfm)."""
     source_path: Annotated[Path | None, arg(aliases=["-s"], metavar="DATA")] = None
     """The same as DATA, for those who know Inria's train.py."""
     run: Annotated[Path | None, arg(aliases=["-m", "--model-path"], metavar="RUN")] = None
@@ -111,6 +111,7 @@ def main(argv: Sequence[str]) -> int:
     """Run `gsopt train` with these arguments: 0 when done or stopped, else a GsoptError or KeyboardInterrupt."""
     flags = tyro.cli(Flags, prog="gsopt train", args=list(argv))
     config, run = read_flags(flags)
+    config = with_poses(config, run)
 
     from gsopt.cli.console import RunConsole
     from gsopt.training.loop import train
@@ -126,6 +127,18 @@ def main(argv: Sequence[str]) -> int:
     finally:
         console.close()
     return 0
+
+
+def with_poses(config: settings.TrainConfig, run: Path) -> settings.TrainConfig:
+    """Photos or a video without poses become a posed scene beside the run; anything else is left as it is."""
+    from gsopt.data.sfm.reuse import needs_poses, posed_scene
+    from gsopt.data.sfm.settings import SfmConfig
+
+    data = Path(config.data.path)
+    if not needs_poses(data):
+        return config
+    scene = posed_scene(data, run.absolute().parent, SfmConfig(seed=config.seed, threads=config.threads), print)
+    return replace(config, data=replace(config.data, path=str(scene)))
 
 
 def judge(config: settings.TrainConfig, result: TrainResult, console: RunConsole) -> None:

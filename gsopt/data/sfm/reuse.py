@@ -1,0 +1,57 @@
+"""Poses for `gsopt train PHOTOS`: none to find where there are some, and none to find twice."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+from gsopt.data import files
+from gsopt.data.scene import is_posed
+from gsopt.data.sfm.features import Say
+from gsopt.data.sfm.photos import find_photos
+from gsopt.data.sfm.pipeline import RECORD, fingerprint, pose_photos
+from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.video import is_video
+from gsopt.errors import InputError
+
+
+def needs_poses(data: Path) -> bool:
+    """True for a video or a folder of photos without poses; False for anything that `load_scene` should judge."""
+    if is_video(data):
+        return data.is_file()
+    if not data.is_dir() or is_posed(data):
+        return False
+    try:
+        return bool(find_photos(data))
+    except InputError:
+        return False
+
+
+def posed_scene(data: Path, folder: Path, config: SfmConfig, say: Say) -> Path:
+    """FOLDER/<name>-posed with the poses of these photos: an earlier one when the photos are still the same."""
+    stem = data.resolve().stem if is_video(data) else data.resolve().name
+    for number in itertools.count(1):
+        scene = folder / (f"{stem}-posed" if number == 1 else f"{stem}-posed-{number}")
+        if not scene.exists():
+            say(f"{data} has no poses: looking for them (gsopt sfm)")
+            posed = pose_photos(data, scene, config, say)
+            for line in posed.diagnosis.lines():
+                say(line)
+            return scene
+        if made_from(scene, data, config):
+            say(f"poses found earlier: {scene}")
+            return scene
+    raise AssertionError("unreachable: count() does not end")
+
+
+def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
+    """Whether the scene was made from these very files, with the same seed."""
+    record = scene / RECORD
+    if not files.is_regular(record) or not is_posed(scene):
+        return False
+    try:
+        found = files.read_json(record)
+        return found["fingerprint"] == fingerprint(data) and found["settings"]["seed"] == config.seed
+    except (InputError, KeyError, TypeError, json.JSONDecodeError):
+        return False
