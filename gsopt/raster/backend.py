@@ -124,8 +124,13 @@ class Backend(Protocol):
         v_depths: Float[Tensor, "H W"] | None = None,
         *,
         absgrad: bool = False,
+        into: Gradients | None = None,
     ) -> Gradients:
-        """Gradients of the parameters that `forward` drew. A frame can be used once."""
+        """Gradients of the parameters that `forward` drew. A frame can be used once.
+
+        `into`: gradients that nobody needs any more; a backend may overwrite and return them, which spares it fresh
+        memory. They serve only while the number of Gaussians stays the same.
+        """
         ...
 
     def photometric(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -96,19 +96,18 @@ class CpuBackend:
         v_depths: Float[Tensor, "H W"] | None = None,
         *,
         absgrad: bool = False,
+        into: Gradients | None = None,
     ) -> Gradients:
         """See `Backend.backward`. The frame's buffers are used again by a later `forward`."""
         context = frame.context
         assert isinstance(context, _Context)
         buffers = context.take()
-        n = len(context.gaussians)
-        gradients = {name: torch.empty_like(tensor) for name, tensor in context.gaussians.items()}
-        means2d, means2d_abs = torch.empty(n, 2), torch.empty(n, 2) if absgrad else None
-        out = _cpu.Gradient(*gradients.values(), means2d, means2d_abs)
+        gradients = _overwritable(context.gaussians, absgrad, into)
+        out = _cpu.Gradient(*(getattr(gradients, field.name) for field in fields(Gradients)))
         alphas, depths = _contiguous(v_alphas), _contiguous(v_depths)
         _cpu.backward(self._workspace, buffers, context.model, _contiguous(v_colors), alphas, depths, out)
         self._idle.append(buffers)
-        return Gradients(**gradients, means2d=means2d, means2d_abs=means2d_abs)
+        return gradients
 
     def release(self, frame: Frame) -> None:
         """Give a frame's buffers back when no `backward` will follow."""
@@ -142,6 +141,15 @@ class CpuBackend:
         """See `Backend.adam`."""
         active = param[0].numel() if len(param) else 0
         _cpu.adam(self._workspace, param, grad, exp_avg, exp_avg_sq, len(param), active, lr, beta1, beta2, eps, step)
+
+
+def _overwritable(gaussians: Gaussians, absgrad: bool, spent: Gradients | None) -> Gradients:
+    """`spent` where its tensors fit, else uninitialised ones."""
+    if spent is not None and spent.shN.shape == gaussians.shN.shape and (spent.means2d_abs is None) != absgrad:
+        return spent
+    n = len(gaussians)
+    empty = {name: torch.empty_like(tensor) for name, tensor in gaussians.items()}
+    return Gradients(**empty, means2d=torch.empty(n, 2), means2d_abs=torch.empty(n, 2) if absgrad else None)
 
 
 def _as_float32(gaussians: Gaussians) -> Gaussians:

@@ -244,8 +244,9 @@ class ReferenceBackend:
         v_depths: Float[Tensor, "H W"] | None = None,
         *,
         absgrad: bool = False,
+        into: Gradients | None = None,
     ) -> Gradients:
-        """Vector-Jacobian product by autograd."""
+        """Vector-Jacobian product by autograd; `into` is left alone."""
         tape = frame.context
         if not isinstance(tape, Tape) or tape.used:
             raise UsageError("This frame's backward pass already ran, or another backend drew it. Draw it again.")

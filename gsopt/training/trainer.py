@@ -70,6 +70,7 @@ class Trainer:
         self.step = 0
         self.shown = Shown()
         self.finished_early = False
+        self._spent: Gradients | None = None  # the last step's gradients: their memory serves again
         self._guidance = guidance
         self._sparse = schedule.is_sparse(config, views)
         self._weights = schedule.weights(config, views)
@@ -131,7 +132,10 @@ class Trainer:
         v_alphas = None
         if self._weights.alpha > 0 and target.alphas is not None:
             v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha)
-        gradients = self.backend.backward(frame, photometric.v_colors, v_alphas, absgrad=self._wants_absgrad())
+        gradients = self.backend.backward(
+            frame, photometric.v_colors, v_alphas, absgrad=self._wants_absgrad(), into=self._spent
+        )
+        self._spent = gradients
         self._density.after_backward(self.step, gradients, frame.radii, target.camera.width, target.camera.height)
         self._show(photometric.loss, frame.colors, target.colors)
         return photometric.loss, self._regularized(gradients, dropout)

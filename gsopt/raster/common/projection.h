@@ -102,37 +102,43 @@ template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<
   return p;
 }
 
-// dLoss/d(what the blending stage saw).
+// The upper triangular factor L of the conic Q = Lᵀ L: (u, v) = L d has dᵀ Q d = u² + v². In these whitened coordinates
+// every splat is a round unit blob, so sums over its pixels neither cancel nor overflow, however thin it is.
+template <class F> struct Whitening {
+  F A, B, C;  // u = A dx + B dy, v = C dy
+};
+template <class F> inline Whitening<F> whitening(const Projected<F>& p) {
+  const F A = sqrt(p.yy / p.det);
+  return {A, splat<F>(0.f) - A * (p.xy / p.yy), splat<F>(1.f) / sqrt(p.yy)};
+}
+
+// dLoss/d(what the blending stage saw): moments of s = dLoss/d ln(alpha) over the splat's pixels.
 template <class F> struct SplatGradient {
-  F mx, my;          // mean2d
-  F a, b, c;         // conic: exponent -(a dx² + 2 b dx dy + c dy²)/2
-  F log_opacity;     // natural logarithm of the effective opacity
+  F u, v, uu, uv, vv;  // Σ s u, ...
+  F log_opacity;       // Σ s: natural logarithm of the effective opacity
+  F mx, my;            // mean2d: Lᵀ (Σ s u, Σ s v)
   F depth;
 };
 
-// Adds to v: mean, quaternion, log scale, logit.
-template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const SplatGradient<F>& v) {
-  const F idet = splat<F>(1.f) / p.det;
-  const F a = p.yy * idet, b = splat<F>(0.f) - p.xy * idet, c = p.xx * idet;
-  // cov2d: -Q G Q with Q the conic, G its gradient; xy counts both off-diagonal entries.
-  const F h_det = (v.a * a + v.b * b + v.c * c) * idet;  // through the determinant
-  F xx = v.c * idet - h_det * p.yy, yy = v.a * idet - h_det * p.xx;
-  F xy = h_det * p.xy * 2.f - v.b * idet;
-  if (cam.antialiased) {  // log opacity holds (log det0 - log det) / 2
-    const F h = v.log_opacity * 0.5f, h0 = h / max(p.det0, splat<F>(1e-30f));
-    xx = xx + h0 * (p.yy - cam.eps2d) - h * a;
-    yy = yy + h0 * (p.xx - cam.eps2d) - h * c;
-    xy = xy - (h0 * p.xy + h * b) * 2.f;
-  }
-  const Vec3<F> vM0 = p.M0 * (xx * 2.f) + p.M1 * xy, vM1 = p.M1 * (yy * 2.f) + p.M0 * xy;
-
+template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const Whitening<F>& L, const SplatGradient<F>& v) {
+  // T and M of project(), whitened: dLoss/d(cov2d) is half of Lᵀ [uu uv; uv vv] L, so that L never has to be undone.
+  const Vec3<F> T0 = p.T0 * L.A + p.T1 * L.B, T1 = p.T1 * L.C;
+  const Vec3<F> M0 = p.M0 * L.A + p.M1 * L.B, M1 = p.M1 * L.C;
+  F uu = v.uu, uv = v.uv, vv = v.vv;
   Splat3D<F> out;
   out.logit = v.log_opacity * (splat<F>(1.f) - p.sigmoid);
-  out.log_scale = {vM0.x * p.M0.x + vM1.x * p.M1.x, vM0.y * p.M0.y + vM1.y * p.M1.y, vM0.z * p.M0.z + vM1.z * p.M1.z};
+  if (cam.antialiased) {  // log opacity holds (log det0 - log det) / 2, and M Mᵀ whitened is M' M'ᵀ
+    const F h = v.log_opacity, ratio = p.det / max(p.det0, splat<F>(1e-30f));
+    uu = uu + h * (dot(M1, M1) * ratio - 1.f);
+    vv = vv + h * (dot(M0, M0) * ratio - 1.f);
+    uv = uv - h * dot(M0, M1) * ratio;
+  }
+  const Vec3<F> vM0 = M0 * uu + M1 * uv, vM1 = M0 * uv + M1 * vv;
+  out.log_scale = {vM0.x * M0.x + vM1.x * M1.x, vM0.y * M0.y + vM1.y * M1.y, vM0.z * M0.z + vM1.z * M1.z};
 
   const Vec3<F> P0 = {vM0.x * p.scale.x, vM0.y * p.scale.y, vM0.z * p.scale.z};
   const Vec3<F> P1 = {vM1.x * p.scale.x, vM1.y * p.scale.y, vM1.z * p.scale.z};
-  const Vec3<F> r0 = p.T0 * P0.x + p.T1 * P1.x, r1 = p.T0 * P0.y + p.T1 * P1.y, r2 = p.T0 * P0.z + p.T1 * P1.z;
+  const Vec3<F> r0 = T0 * P0.x + T1 * P1.x, r1 = T0 * P0.y + T1 * P1.y, r2 = T0 * P0.z + T1 * P1.z;
   // dLoss/dR has columns r0, r1, r2; chain to the unit quaternion, then through the normalisation.
   const F w = p.qw, x = p.qx, y = p.qy, z = p.qz;
   const F a12 = r1.z - r2.y, a20 = r2.x - r0.z, a01 = r0.y - r1.x;
@@ -145,15 +151,16 @@ template <class F> inline Splat3D<F> project_backward(const Camera& cam, const P
   out.qw = (gw - w * radial) * iq, out.qx = (gx - x * radial) * iq;
   out.qy = (gy - y * radial) * iq, out.qz = (gz - z * radial) * iq;
 
-  const Vec3<F> vT0 = p.R.c0 * P0.x + p.R.c1 * P0.y + p.R.c2 * P0.z;
-  const Vec3<F> vT1 = p.R.c0 * P1.x + p.R.c1 * P1.y + p.R.c2 * P1.z;
+  const Vec3<F> wT0 = p.R.c0 * P0.x + p.R.c1 * P0.y + p.R.c2 * P0.z;  // of the whitened T
+  const Vec3<F> wT1 = p.R.c0 * P1.x + p.R.c1 * P1.y + p.R.c2 * P1.z;
+  const Vec3<F> vT0 = wT0 * L.A, vT1 = wT0 * L.B + wT1 * L.C;
   const Vec3<F> W0 = splat3<F>(cam.R), W1 = splat3<F>(cam.R + 3), W2 = splat3<F>(cam.R + 6);
   const F h0 = p.iz * cam.fx, h1 = p.iz * cam.fy;
   const F zero = splat<F>(0.f);
   const F vux = v.mx * cam.fx + select(p.ux == p.vx, zero - h0 * dot(vT0, W2), zero);
   const F vuy = v.my * cam.fy + select(p.uy == p.vy, zero - h1 * dot(vT1, W2), zero);
   const F vtx = vux * p.iz, vty = vuy * p.iz;
-  const F vtz = v.depth - (dot(vT0, p.T0) + dot(vT1, p.T1) + vux * p.ux + vuy * p.uy) * p.iz;
+  const F vtz = v.depth - (dot(wT0, T0) + dot(wT1, T1) + vux * p.ux + vuy * p.uy) * p.iz;
   out.mean = W0 * vtx + W1 * vty + W2 * vtz;
   return out;
 }

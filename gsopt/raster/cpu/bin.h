@@ -77,18 +77,16 @@ inline void offset_stage(Frame& frame, int chunks) {
   for (int64_t n = 0; n < frame.count; ++n) records[n].slot = slot, slot += records[n].count;
   frame.intersections = slot;
   uint32_t *counts = frame.histogram.as<uint32_t>(), *tile_begin = frame.tile_begin.as<uint32_t>();
-  uint32_t* word_begin = frame.word_begin.as<uint32_t>();
-  uint32_t entry = 0, word = 0;
+  uint32_t entry = 0;
   for (int tile = 0; tile < frame.tiles(); ++tile) {
-    tile_begin[tile] = entry, word_begin[tile] = word;
+    tile_begin[tile] = entry;
     for (int chunk = 0; chunk < chunks; ++chunk) {
       uint32_t& c = counts[static_cast<int64_t>(chunk) * frame.tiles() + tile];
       const uint32_t count = c;
       c = entry, entry += count;
     }
-    word += (entry - tile_begin[tile] + 63) / 64;
   }
-  tile_begin[frame.tiles()] = entry, word_begin[frame.tiles()] = word;
+  tile_begin[frame.tiles()] = entry;
 }
 
 inline void fill_stage(Pool& pool, Frame& frame, int chunks) {
@@ -116,7 +114,7 @@ inline void bin_stage(Pool& pool, Frame& frame) {
   count_stage(pool, frame, chunks);
   offset_stage(frame, chunks);
   frame.entries.reserve(sizeof(Entry) * frame.intersections);
-  frame.words.reserve(sizeof(uint64_t) * kBlocks * frame.word_begin.as<uint32_t>()[frame.tiles()]);
+  frame.masks.reserve(sizeof(uint32_t) * frame.intersections);
   fill_stage(pool, frame, chunks);
 }
 

@@ -44,8 +44,8 @@ struct Entry {
   uint32_t id, slot;
 };
 
-// One row of gradient sums per entry: moments of s about the splat's centre, then color, depth, |gradient|.
-enum RowField { kS, kSx, kSy, kSxx, kSxy, kSyy, kWr, kWg, kWb, kWz, kAbsX, kAbsY, kRow = 16 };
+// One row of gradient sums per entry: moments of s in the splat's whitened coordinates, then color, depth, |gradient|.
+enum RowField { kS, kSu, kSv, kSuu, kSuv, kSvv, kWr, kWg, kWb, kWz, kAbsX, kAbsY, kRow = 16 };
 
 struct Parameters {
   int64_t count;
@@ -68,9 +68,8 @@ struct Frame {
   Buffer keys2, order2;      // scratch of the sort
   Buffer histogram, chunks;  // scratch of sort and binning
   Buffer tile_begin;         // uint32[tiles + 1]: first entry of a tile
-  Buffer word_begin;         // uint32[tiles + 1]: first mask word of a tile
   Buffer entries;            // Entry[intersections]
-  Buffer words;              // uint64[words][blocks]: bit k of word w: does splat 64 w + k touch the block?
+  Buffer masks;              // uint32[intersections]: bit b: the splat changed block b of the tile
   Buffer transmittance;      // float[tiles][blocks][pixels]
   Buffer last;               // int32[tiles][blocks][pixels]: last contributing entry of the tile, -1 if none
   Buffer rows;               // float[intersections][kRow]

@@ -49,7 +49,8 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
   const Projected<f8> p = project(cam, g);
 
   const f8 k = splat<f8>(kHalfLog2E);
-  const f8 A = sqrt(k * p.yy / p.det), B = splat<f8>(0.f) - A * (p.xy / p.yy), C = sqrt(k / p.yy);
+  const Whitening<f8> L = whitening(p);
+  const f8 A = L.A * kSqrtHalfLog2E, B = L.B * kSqrtHalfLog2E, C = L.C * kSqrtHalfLog2E;
   const f8 lo = log2(max(p.opacity, splat<f8>(1e-37f)));
   const f8 reach = max(lo - kLog2AlphaMin, splat<f8>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
   const f8 rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
@@ -163,13 +164,13 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   }
   const Splat3D<f8> g = load_splats(P, index);
   const Projected<f8> p = project(cam, g);
-  const f8 zero = splat<f8>(0.f), idet = splat<f8>(1.f) / p.det;
-  const f8 a = p.yy * idet, b = zero - p.xy * idet, c = p.xx * idet;
-  const SplatGradient<f8> v = {a * field[kSx] + b * field[kSy], b * field[kSx] + c * field[kSy],
-                               field[kSxx] * -0.5f,             zero - field[kSxy],
-                               field[kSyy] * -0.5f,             field[kS],
-                               field[kWz]};
-  Splat3D<f8> out = project_backward(cam, p, v);
+  const Whitening<f8> L = whitening(p);
+  // Blending measures u and v in units of sqrt(kHalfLog2E).
+  constexpr float unit = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
+  const f8 su = field[kSu] * unit, sv = field[kSv] * unit;
+  const SplatGradient<f8> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
+                               L.A * su, L.B * su + L.C * sv, field[kWz]};
+  Splat3D<f8> out = project_backward(cam, p, L, v);
 
   f8 basis[15], bx[15], by[15], bz[15], inv;
   alignas(32) float Y[15][kLanes], Yx[15][kLanes], Yy[15][kLanes], Yz[15][kLanes];

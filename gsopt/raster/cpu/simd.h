@@ -67,25 +67,14 @@ inline f8 max(f8 a, f8 b) { return a > b ? a : b; }
 inline i8 shift_left(i8 a, i8 n) { return a << n; }
 #endif
 
-// Bit b of lane l becomes bit l of byte b, for the lowest `Bits` bits; the bytes are `stride` apart.
-template <int Bits> inline void gather_bits(i8 lanes, uint8_t* out, int stride) {
-#if defined(__AVX2__)
-  // First the bytes: all lanes' lowest, then all lanes' next. One movemask then takes a bit of every byte.
-  const __m256i group = _mm256_setr_epi8(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15, 0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-  __m256i bytes = _mm256_permutevar8x32_epi32(_mm256_shuffle_epi8((__m256i)lanes, group), _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
-  for (int bit = 7; bit >= 0; --bit, bytes = _mm256_add_epi8(bytes, bytes)) {
-    const uint32_t taken = static_cast<uint32_t>(_mm256_movemask_epi8(bytes));
-    for (int k = 0; k < Bits / 8; ++k) out[(8 * k + bit) * stride] = static_cast<uint8_t>(taken >> (8 * k));
-  }
-#else
-  for (int bit = 0; bit < Bits; ++bit) out[bit * stride] = static_cast<uint8_t>(movemask(lanes << (31 - bit)));
-#endif
-}
-
 inline bool any(i8 m) { return movemask(m) != 0; }
 inline f8 clamp(f8 x, f8 lo, f8 hi) { return min(max(x, lo), hi); }
 
-inline float sum(f8 a) { return ((a[0] + a[4]) + (a[1] + a[5])) + ((a[2] + a[6]) + (a[3] + a[7])); }
+inline float sum(f8 a) {
+  a += __builtin_shufflevector(a, a, 4, 5, 6, 7, 0, 1, 2, 3);
+  a += __builtin_shufflevector(a, a, 2, 3, 0, 1, 6, 7, 4, 5);
+  return a[0] + a[1];
+}
 
 inline i8 shift_exponent(i8 n) { return n << 23; }
 
@@ -128,23 +117,6 @@ inline pxi splat_pxi(int32_t x) { return splat8i(x); }
 #endif
 constexpr int kPixels = sizeof(px) / sizeof(float);  // pixels of a block, always 4 wide
 constexpr int kBlocks = 256 / kPixels;               // blocks of a 16x16 tile
-
-// Two splats side by side. An exponential is one long chain of dependent operations; two chains written in lockstep
-// keep both multipliers busy, which the processor's window is too short to find by itself.
-struct pxi2 {
-  pxi a, b;
-};
-struct px2 {
-  px a, b;
-};
-inline px2 operator+(px2 x, px2 y) { return {x.a + y.a, x.b + y.b}; }
-inline px2 operator-(px2 x, px2 y) { return {x.a - y.a, x.b - y.b}; }
-inline px2 operator*(px2 x, px2 y) { return {x.a * y.a, x.b * y.b}; }
-inline pxi2 operator+(pxi2 x, pxi2 y) { return {x.a + y.a, x.b + y.b}; }
-template <> inline px2 splat<px2>(float x) { return {splat<px>(x), splat<px>(x)}; }
-inline pxi2 bits(px2 v) { return {bits(v.a), bits(v.b)}; }
-inline px2 from_bits(pxi2 v) { return {from_bits(v.a), from_bits(v.b)}; }
-inline pxi2 shift_exponent(pxi2 n) { return {shift_exponent(n.a), shift_exponent(n.b)}; }
 
 // 2^x for |x| < 126, relative error 1.5e-7: minimax polynomial of degree 5 on [-1/2, 1/2] (Remez, relative weight)
 // times a power of two put together from its bits. Outside that range the result is arbitrary but harmless: mask it.
@@ -192,6 +164,19 @@ inline void transpose8(f8 r[8]) {
     r[i] = __builtin_shufflevector(b[i], b[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
     r[i + 4] = __builtin_shufflevector(b[i], b[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
   }
+}
+
+inline f8 fold(f8 a) { return a; }
+#if defined(__AVX512F__)
+inline f8 fold(f16 a) { return (f8)_mm512_castps512_ps256((__m512)a) + (f8)_mm512_extractf32x8_ps((__m512)a, 1); }
+#endif
+
+// The sums of the lanes of eight vectors, in one.
+inline f8 sums(px a, px b, px c, px d, px e, px f, px g, px h) {
+  const auto halves = [](f8 x, f8 y) { return __builtin_shufflevector(x, y, 0, 8, 1, 9, 4, 12, 5, 13) + __builtin_shufflevector(x, y, 2, 10, 3, 11, 6, 14, 7, 15); };
+  const auto quarters = [](f8 x, f8 y) { return __builtin_shufflevector(x, y, 0, 1, 8, 9, 4, 5, 12, 13) + __builtin_shufflevector(x, y, 2, 3, 10, 11, 6, 7, 14, 15); };
+  const f8 low = quarters(halves(fold(a), fold(b)), halves(fold(c), fold(d))), high = quarters(halves(fold(e), fold(f)), halves(fold(g), fold(h)));
+  return __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
 }
 
 }  // namespace gsopt::GSOPT_ISA
