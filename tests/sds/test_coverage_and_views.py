@@ -1,0 +1,232 @@
+"""What the inputs decide, where guidance looks, and what word stands for a side."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gsopt.cameras import Cameras, intrinsics, look_at
+from gsopt.gaussians import Gaussians
+from gsopt.guidance_config import GuidanceConfig
+from gsopt.raster.api import make_backend
+from gsopt.sds import coverage, schedule
+from gsopt.sds.noise import generator
+from gsopt.sds.prior import References
+from gsopt.sds.views import AZIMUTHS, HIGHEST, LOWEST, draw_candidate, make_rig, nearest, square
+
+BACKEND = make_backend("cpu", 1)
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def camera(azimuth: float, elevation: float = 0.0, distance: float = 4.0, width: int = 64, height: int = 64) -> Cameras:
+    a, e = math.radians(azimuth), math.radians(elevation)
+    eye = distance * torch.tensor([[math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]]).double()
+    viewmat = look_at(eye, torch.zeros(3, dtype=torch.float64), UP)
+    return Cameras(viewmat.float(), intrinsics(0.8, width, height)[None].float(), width, height)
+
+
+def wall(x: float, *, scale: float = 0.1, thin: float = 0.01) -> Gaussians:
+    """An opaque sheet of discs facing +x at this x, 1.6 units wide."""
+    line = torch.linspace(-0.8, 0.8, 17)
+    y, z = torch.meshgrid(line, line, indexing="ij")
+    n = y.numel()
+    return Gaussians(
+        means=torch.stack([torch.full((n,), x), y.flatten(), z.flatten()], dim=1),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        log_scales=torch.tensor([[thin, scale, scale]]).log().repeat(n, 1),
+        logit_opacities=torch.full((n,), 4.0),
+        sh0=torch.zeros(n, 1, 3),
+        shN=torch.zeros(n, 0, 3),
+    )
+
+
+TWO_WALLS = wall(0.5).append(wall(-0.5))
+FRONT, BACK = slice(0, 289), slice(289, 578)
+
+
+def test_what_an_input_sees_is_covered_and_what_lies_behind_is_not() -> None:
+    covered = coverage.coverage(TWO_WALLS, [camera(0)], BACKEND)
+    assert float(covered[FRONT].min()) > 0.9
+    inner = TWO_WALLS.means[BACK, 1:].abs().amax(1) < 0.7  # the rim may peep past the front wall
+    assert float(covered[BACK][inner].max()) == 0.0
+
+
+def test_every_view_that_sees_it_adds_up_and_uncertainty_falls() -> None:
+    inputs = [camera(azimuth) for azimuth in (0, 10, -10, 20)]
+    means = []
+    for count in range(5):
+        covered = coverage.coverage(TWO_WALLS, inputs[:count], BACKEND)
+        means.append(float(coverage.uncertainty(covered)[FRONT].mean()))
+    assert means[0] == 1.0
+    assert all(later < 0.45 * before for before, later in itertools.pairwise(means))
+
+
+def test_a_disc_seen_edge_on_does_not_count_and_a_ball_does_from_everywhere() -> None:
+    eye = torch.tensor([0.5, 4.0, 0.0])
+    assert float(coverage.facing(wall(0.5), eye).max()) < 0.11
+    assert float(coverage.facing(wall(0.5), torch.tensor([4.0, 0.0, 0.0])).min()) > 0.9
+    ball = wall(0.5, scale=0.1, thin=0.1)
+    assert coverage.facing(ball, eye).tolist() == [1.0] * len(ball)
+
+
+def test_the_map_is_bright_from_behind_and_dark_from_the_input() -> None:
+    u = coverage.uncertainty(coverage.coverage(TWO_WALLS, [camera(0), camera(8)], BACKEND))
+    seen, unseen = (coverage.uncertainty_map(TWO_WALLS, u, camera(a), BACKEND) for a in (4, 180))
+    middle = slice(28, 36)
+    assert float(seen[middle, middle].mean()) < 0.2
+    assert float(unseen[middle, middle].mean()) > 0.9
+    assert float(unseen[0].max()) == 0.0  # nothing there, nothing to guide
+    means = coverage.mean_uncertainty(TWO_WALLS, u, Cameras.cat([camera(4), camera(180), camera(90)]), BACKEND)
+    assert float(means[0]) < float(means[2]) < float(means[1])
+
+
+def test_an_empty_view_is_not_uncertain() -> None:
+    away = replace(camera(0), viewmats=look_at(torch.tensor([[9.0, 0, 0]]), torch.tensor([20.0, 0, 0]), UP.float()))
+    assert coverage.mean_uncertainty(TWO_WALLS, torch.ones(578), away, BACKEND).tolist() == [0.0]
+
+
+def test_coverage_does_not_depend_on_the_world_frame() -> None:
+    """Rotating and shifting Gaussians and cameras together changes nothing."""
+    from gsopt.quats import multiply
+
+    half = math.sqrt(0.5)
+    turn = torch.tensor([half, 0.0, 0.0, half])  # 90 degrees about z
+    R, t = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), torch.tensor([1.0, 2.0, 3.0])
+    moved = replace(TWO_WALLS, means=TWO_WALLS.means @ R.T + t, quats=multiply(turn.expand(578, 4), TWO_WALLS.quats))
+    original = camera(20, 10)
+    viewmat = original.viewmats.clone()
+    viewmat[0, :3, :3] = viewmat[0, :3, :3] @ R.T
+    viewmat[0, :3, 3] -= viewmat[0, :3, :3] @ t
+    a = coverage.coverage(TWO_WALLS, [original], BACKEND)
+    b = coverage.coverage(moved, [replace(original, viewmats=viewmat)], BACKEND)
+    torch.testing.assert_close(a, b, rtol=0, atol=1e-3)
+
+
+def test_no_more_views_are_looked_through_than_matter() -> None:
+    many = [camera(3.6 * i) for i in range(100)]
+    assert len(coverage.spread(many)) == coverage.MOST_VIEWS
+    assert coverage.spread(many[:5]) == many[:5]
+
+
+INPUTS = [camera(0, 20), camera(40, 20), camera(80, 20), camera(-40, 20)]
+
+
+def test_candidates_stand_around_the_subject_and_look_at_it() -> None:
+    rig = make_rig(INPUTS, 2.0, 32, INPUTS[0])
+    assert len(rig.candidates) == 3 * AZIMUTHS
+    assert (rig.candidates.width, rig.candidates.height) == (32, 32)
+    torch.testing.assert_close(rig.candidates.centers.norm(dim=1), torch.full((36,), 4.0), rtol=0, atol=1e-2)
+    towards = torch.nn.functional.normalize(-rig.candidates.centers, dim=1)
+    assert float((towards * rig.candidates.forwards).sum(1).min()) > 0.999
+    elevations = torch.asin(rig.candidates.centers[:, 2] / 4)
+    assert float(elevations.min()) >= LOWEST - 1e-3
+    assert float(elevations.max()) <= HIGHEST + 1e-3
+
+
+def test_a_wide_image_gives_the_field_of_view_of_its_middle_square() -> None:
+    wide = camera(0, 20, width=96, height=64)
+    rig = make_rig([wide, camera(40, 20, width=96, height=64)], 2.0, 32, wide)
+    assert float(rig.K[0, 0]) == pytest.approx(float(wide.Ks[0, 1, 1]) / 2)
+    cut = square(wide, 32)
+    assert (cut.width, cut.height) == (32, 32)
+    assert cut.Ks[0, :2, 2].tolist() == [16.0, 16.0]
+
+
+def test_cameras_that_look_at_no_common_subject_are_interpolated() -> None:
+    eyes = torch.tensor([[x, 0.0, 0.0] for x in (0.0, 1.0, 2.0)])
+    outward = torch.tensor([[-1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
+    viewmats = torch.cat([look_at(eyes[i : i + 1], eyes[i] + outward[i], UP.float()) for i in range(3)])
+    inputs = [Cameras(viewmats[i : i + 1], intrinsics(0.8, 64, 64)[None].float(), 64, 64) for i in range(3)]
+    rig = make_rig(inputs, 1.0, 32, inputs[0])
+    assert rig.angles is None
+    assert float(rig.candidates.centers[:, 0].min()) >= -1e-4
+    assert float(rig.candidates.centers[:, 0].max()) <= 2 + 1e-4
+    assert torch.equal(rig.camera(3, generator(0, 0, 0, "jitter")).viewmats, rig.candidates[3].viewmats)
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "side"),
+    [
+        (30, 10, "front"),
+        (74, 10, "front"),
+        (-14, 10, "front"),
+        (90, 10, "side"),
+        (-60, 0, "side"),
+        (200, 0, "back"),
+        (30, 70, "top"),
+    ],
+)
+def test_a_side_is_told_from_the_front_camera(azimuth: float, elevation: float, side: str) -> None:
+    rig = make_rig(INPUTS, 2.0, 32, camera(30, 20))
+    assert rig.side(camera(azimuth, elevation), front_known=True) == side
+    assert rig.side(camera(azimuth, elevation), front_known=False) == ("top" if side == "top" else "")
+
+
+def test_a_drawn_candidate_is_moved_a_little_and_the_same_way_again() -> None:
+    rig = make_rig(INPUTS, 2.0, 32, INPUTS[0])
+    one, again, other = (rig.camera(5, generator(0, step, 5, "jitter")) for step in (1, 1, 2))
+    assert torch.equal(one.viewmats, again.viewmats)
+    assert not torch.equal(one.viewmats, other.viewmats)
+    angle = torch.acos((one.forwards[0] @ rig.candidates.forwards[5]).clamp(-1, 1))
+    assert 0 < float(angle) < math.radians(17)
+
+
+def test_candidates_are_drawn_in_proportion_to_their_uncertainty() -> None:
+    mean_u = torch.tensor([0.6, 0.2, 0.04, 0.0])
+    drawn = Counter(draw_candidate(mean_u, 0.05, generator(0, i, 0, "camera")) for i in range(2000))
+    assert set(drawn) == {0, 1}
+    assert drawn[0] / 2000 == pytest.approx(0.75, abs=0.04)
+
+
+def test_nothing_is_drawn_where_the_inputs_decide() -> None:
+    assert draw_candidate(torch.tensor([0.04, 0.0]), 0.05, generator(0, 0, 0, "camera")) is None
+    assert draw_candidate(torch.zeros(3), 0.0, generator(0, 0, 0, "camera")) is None
+
+
+def test_the_nearest_references_come_first() -> None:
+    cameras = Cameras.cat([square(camera(a), 8) for a in (0, 90, 180, 45)])
+    images = torch.arange(4.0)[:, None, None, None].expand(4, 3, 8, 8)
+    references = References(images, torch.ones(4, 1, 8, 8), cameras)
+    found = nearest(references, camera(60), 2)
+    assert found is not None
+    assert found.images[:, 0, 0, 0].tolist() == [3.0, 1.0]
+    torch.testing.assert_close(found.cameras.viewmats[1], cameras.viewmats[1])
+    assert nearest(references, camera(60), 0) is None
+    everything = nearest(references, camera(60), 9)
+    assert everything is not None
+    assert len(everything.images) == 4
+
+
+CONFIG = GuidanceConfig(start=0.25, stop=0.75, every=10, t_max=0.7, t_max_end=0.25)
+
+
+def test_guided_steps_lie_after_the_warm_up_and_every_kth() -> None:
+    guided = [step for step in range(1, 401) if schedule.is_guided(step, CONFIG, 400)]
+    assert guided == list(range(100, 301, 10))
+    assert schedule.guided_steps(CONFIG, 400) == len(guided)
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3, 17, 400])
+@pytest.mark.parametrize(
+    "config", [CONFIG, replace(CONFIG, start=0.0, stop=1.0, every=1), replace(CONFIG, start=1.0, stop=1.0)]
+)
+def test_the_number_of_guided_steps_is_what_the_schedule_counts(config: GuidanceConfig, iterations: int) -> None:
+    counted = sum(schedule.is_guided(step, config, iterations) for step in range(1, iterations + 1))
+    assert schedule.guided_steps(config, iterations) == counted
+
+
+@pytest.mark.parametrize("anneal", ["sqrt", "linear"])
+def test_the_most_noise_falls_from_first_to_last(anneal) -> None:
+    config = replace(CONFIG, anneal=anneal)
+    most = [schedule.noise_range(step, config, 400)[1] for step in range(100, 301, 10)]
+    assert (most[0], most[-1]) == (pytest.approx(0.7), pytest.approx(0.25))
+    assert all(later < before for before, later in itertools.pairwise(most))
+    assert {schedule.noise_range(step, config, 400)[0] for step in (100, 300)} == {0.02}
+    assert schedule.noise_range(200, replace(CONFIG, anneal="sqrt"), 400) < schedule.noise_range(
+        200, replace(CONFIG, anneal="linear"), 400
+    )
