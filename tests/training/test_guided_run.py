@@ -1,0 +1,134 @@
+"""Runs that are guided: the same bits after a resume, statistics untouched, and nothing loaded where lambda is 0."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_scenes import tiny_config
+
+from gsopt.config import TrainConfig
+from gsopt.errors import InputError
+from gsopt.events import read_events
+from gsopt.guidance_config import GuidanceConfig
+from gsopt.training import guided_run
+from gsopt.training.loop import train
+from gsopt.training.trainer import Trainer
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sds"))
+from priors import PixelPrior, gaussian_posterior
+
+GUIDANCE = GuidanceConfig(
+    prior="toy/prior", start=0.2, stop=1.0, every=2, min_uncertainty=0.0, guard_views=0, guidance_scale=1.0
+)
+
+
+@pytest.fixture
+def prior(monkeypatch: pytest.MonkeyPatch) -> PixelPrior:
+    toy = PixelPrior(gaussian_posterior(0.2, 0.5), size=16)
+    monkeypatch.setattr(guided_run, "open_prior", lambda name, config: toy)
+    return toy
+
+
+def config(dataset: Path, **changes: object) -> TrainConfig:
+    return tiny_config(dataset, guidance=replace(GUIDANCE, **changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("policy", ["sds", "recon", "sdi"])
+def test_stopped_and_resumed_is_the_run_that_never_stopped(
+    policy: str, dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guided = config(dataset, policy=policy)
+    train(guided, tmp_path / "whole")
+    original = Trainer._update
+
+    def update(trainer: Trainer, *args) -> None:
+        if trainer.step == 17:
+            (tmp_path / "run" / "stop").touch()
+        original(trainer, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_update", update)
+        assert train(guided, tmp_path / "run").stopped
+    train(guided, tmp_path / "run", resume=True)
+    whole, resumed = ((tmp_path / name / "splat.ply").read_bytes() for name in ("whole", "run"))
+    assert whole == resumed
+    train(tiny_config(dataset, guidance=GuidanceConfig(lambda_sds=0)), tmp_path / "plain")
+    assert (tmp_path / "plain" / "splat.ply").read_bytes() != whole
+
+
+def test_guidance_reaches_the_parameters_and_not_the_statistics(
+    dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Density control takes note before guidance is added, and guidance leaves means2d as it is."""
+    from gsopt.training.guidance import RunGuidance
+
+    original, seen = RunGuidance.add, []
+
+    def add(guidance, step, gaussians, settings, gradients) -> None:
+        before = gradients.means2d.clone(), gradients.sh0.clone()
+        original(guidance, step, gaussians, settings, gradients)
+        seen.append((torch.equal(gradients.means2d, before[0]), torch.equal(gradients.sh0, before[1])))
+
+    monkeypatch.setattr(RunGuidance, "add", add)
+    train(config(dataset), tmp_path / "run")
+    assert all(statistics for statistics, _ in seen)
+    assert sum(not same for _, same in seen) == 13
+
+
+def test_the_run_keeps_what_guided_it(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    train(config(dataset), tmp_path / "run")
+    folder = tmp_path / "run" / "guidance"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["guided"], summary["wanted"], summary["lambda_sds"]) == (13, 13, 0.2)
+    assert (folder / "conditioning.safetensors").is_file()
+    assert len(list(folder.glob("before_*.png"))) == len(list(folder.glob("after_*.png"))) > 0
+    assert len(list(folder.glob("step_*_proposal.png"))) == 4
+    told = [event for event in read_events(tmp_path / "run" / "events.jsonl")[0] if event["kind"] == "started"]
+    assert told[0]["guidance"]["prior"] == "toy/prior"
+
+
+def test_a_prior_that_answers_nan_never_loses_the_reconstruction(
+    dataset: Path, tmp_path: Path, prior: PixelPrior
+) -> None:
+    prior.answer = lambda x_t, a, c: torch.full_like(x_t, float("nan"))
+    assert train(config(dataset), tmp_path / "run").steps == 30
+    train(tiny_config(dataset, guidance=GuidanceConfig(lambda_sds=0)), tmp_path / "plain")
+    guided, plain = ((tmp_path / name / "splat.ply").read_bytes() for name in ("run", "plain"))
+    assert guided == plain
+    assert "without guidance" in (tmp_path / "run" / "events.jsonl").read_text()
+
+
+def test_the_guard_turns_off_what_hurts_and_keeps_what_helps(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    prior.answer = lambda x_t, a, c: -torch.ones_like(x_t)  # everything is black
+    hurting = config(dataset, guard_views=1, guard_steps=40, lambda_sds=50.0, weighting="x0", clip_rms=0.0)
+    train(hurting, tmp_path / "run")
+    guard = json.loads((tmp_path / "run" / "config.json").read_text())["guidance"]["guard"]
+    assert guard["factor"] < 1
+    assert guard["trials"][0]["guided"] < guard["trials"][0]["plain"]
+
+
+def test_a_corrupt_reference_image_stops_before_any_training(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    (tmp_path / "ref.png").write_bytes(b"\x89PNG\r\n\x1a\n and then nothing")
+    with pytest.raises(InputError, match=r"ref\.png"):
+        train(config(dataset, ref_image=(str(tmp_path / "ref.png"),)), tmp_path / "run")
+
+
+def test_without_a_prior_nothing_of_diffusion_is_loaded_and_the_reason_is_told(dataset: Path, tmp_path: Path) -> None:
+    import subprocess
+
+    script = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from pathlib import Path\nfrom tiny_scenes import tiny_config\nfrom gsopt.training.loop import train\n"
+        f"train(tiny_config(Path({str(dataset)!r}), iterations=2), Path({str(tmp_path / 'run')!r}))\n"
+        "assert not {'diffusers', 'transformers', 'huggingface_hub'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    started = read_events(tmp_path / "run" / "events.jsonl")[0][0]
+    assert started["guidance"]["prior"] is None
+    assert "no prior at hand" in started["guidance"]["reason"]
