@@ -4,7 +4,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 RUN ?=
-TEST_EXTRAS := dev,viewer,video,spz,blender,sfm
+TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds
 
 VENV := .venv
 PY := $(VENV)/bin/python
