@@ -46,3 +46,12 @@ SSIM_GRADIENT = 2e-4
 
 # One Adam step in float32, relative to the step: a square root, a division and four products.
 ADAM = 1e-6
+
+# The stress suite permits more than IMAGE and GRADIENT only for these reasons.
+# A needle of 1e6 : 1 whose ends are 6000 px away: its direction, known to 6e-8, decides where it passes each pixel.
+SLANT = 2e-4
+# Three scales up to 1e18 apart: two axes of 1e6 and 1e3 px may project to nearly one line, and the width of what is
+# left is the difference of their products.
+SHEARED = 2e-3
+# Hundreds of equal layers round to the same side each time: some 1000 roundings of 6e-8 add up.
+MANY_LAYERS = 2e-4

@@ -1,0 +1,74 @@
+"""What figures depend on besides the code: the machine, its load, and what one core of it can do at best."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from gsopt import __version__
+
+
+def machine() -> dict[str, Any]:
+    """Metadata that every result carries (`schema.MACHINE`)."""
+    return {
+        "cpu": cpu_name(),
+        "cores": os.cpu_count() or 1,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": importlib.metadata.version("torch"),
+        "gsopt": __version__,
+        "commit": commit(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
+
+
+def cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def commit() -> str | None:
+    """The commit that the sources stand at, with + when files differ from it; None for an installed package."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+"],
+            cwd=root,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=20,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()
+
+
+def calibration() -> dict[str, dict[str, float]]:
+    """Fused multiply-adds and exponentials per second of one core, by instruction set, in CPU time."""
+    from gsopt.raster import _cpu  # type: ignore[attr-defined]
+
+    rates = {}
+    for isa in _cpu.instruction_sets():
+        fma, exp = _cpu.Workspace(1, isa).calibrate()
+        rates[isa] = {"fma_per_second": fma, "exp_per_second": exp}
+    return rates
+
+
+def resident_mb() -> float | None:
+    """Memory that this process holds now, MB (10^6 bytes); None where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
