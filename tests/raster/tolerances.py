@@ -55,3 +55,5 @@ SLANT = 2e-4
 SHEARED = 2e-3
 # Hundreds of equal layers round to the same side each time: some 1000 roundings of 6e-8 add up.
 MANY_LAYERS = 2e-4
+# 2e6 m from the origin neighbouring float32 numbers are 0.1 to 0.25 m apart; the splats are 100 m wide.
+FAR = 3e-3
