@@ -8,7 +8,8 @@ The image model, which the float64 reference defines and every backend follows:
 
 * camera space t = viewmat · mean; a Gaussian is drawn when near_plane < t_z < far_plane.
 * cov2d = J W Σ Wᵀ Jᵀ + eps2d·I with J the Jacobian of the pinhole projection at t, its t_x/t_z and t_y/t_z clamped to
-  the view widened by 30 % of tan(fov/2) on either side (Zwicker 2001; Kerbl et al. 2023).
+  the view widened by 30 % of tan(fov/2) on either side (Zwicker 2001; Kerbl et al. 2023). Where det cov2d < 1e-12 px⁴
+  nothing is drawn; that takes an eps2d near 0.
 * opacity o = sigmoid(logit), times sqrt(max(0, det cov / det cov2d)) when antialiased (Yu et al. 2024).
 * alpha(p) = min(0.99, o · exp(-½ (p-mean2d)ᵀ cov2d⁻¹ (p-mean2d))), p the pixel centre; below 1/255 it contributes
   nothing. Where alpha is clamped to 0.99 the gradient with respect to o and the exponent is zero: the true derivative.
@@ -32,6 +33,7 @@ from gsopt.gaussians import Gaussians
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
+DET_MIN = 1e-12
 
 
 @dataclass(frozen=True)

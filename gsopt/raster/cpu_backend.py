@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.cameras import Cameras
-from gsopt.errors import UsageError
+from gsopt.errors import NumericalError, UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.backend import Frame, Gradients, Photometric, RasterSettings
@@ -85,7 +85,13 @@ class CpuBackend:
         radii = torch.empty(n, 2, dtype=torch.int32)
         behind = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
         degree = min(settings.sh_degree, gaussians.sh_degree)
-        _cpu.forward(self._workspace, frame, model, degree, view, behind, colors, alphas, depths, radii)
+        try:
+            _cpu.forward(self._workspace, frame, model, degree, view, behind, colors, alphas, depths, radii)
+        except (MemoryError, OverflowError) as error:
+            raise NumericalError(
+                f"Drawing {n:,} Gaussians at {width}x{height} needs more memory than there is: {error}. Draw fewer or "
+                "smaller splats, or a smaller image (`-r`)."
+            ) from error
         return Frame(colors, alphas, depths, radii, _Context(frame, model, gaussians))
 
     def backward(

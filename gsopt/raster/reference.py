@@ -23,6 +23,7 @@ from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster.backend import (
     ALPHA_MAX,
     ALPHA_MIN,
+    DET_MIN,
     TRANSMITTANCE_MIN,
     Frame,
     Gradients,
@@ -118,7 +119,8 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
     T = jacobians(points, K, camera.width, camera.height) @ R
     cov = T @ covariances(gaussians.quats, gaussians.log_scales) @ T.transpose(-1, -2)
     cov2d = cov + settings.eps2d * torch.eye(2, dtype=cov.dtype, device=cov.device)
-    opacities = gaussians.opacities
+    # The logarithm first: its derivative 1 - sigmoid keeps its digits where the sigmoid rounds to 1.
+    opacities = torch.nn.functional.logsigmoid(gaussians.logit_opacities).exp()
     return Projection(
         points=points,
         means2d=points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2],
@@ -145,7 +147,7 @@ def visible_rows(
     z, means2d, reach = projection.points[:, 2], projection.means2d, extents(projection)
     size = means2d.new_tensor([camera.width, camera.height])
     visible = ((means2d + reach > 0) & (means2d - reach < size)).all(dim=-1)
-    visible &= (z > settings.near_plane) & (z < settings.far_plane) & (determinants(projection.cov2d) > 0)
+    visible &= (z > settings.near_plane) & (z < settings.far_plane) & (determinants(projection.cov2d) >= DET_MIN)
     radii = torch.zeros(len(gaussians), 2, dtype=torch.int32, device=z.device)
     radii[visible] = reach[visible].ceil().clamp_max(RADIUS_MAX).to(torch.int32)
     rows = torch.nonzero(visible)[:, 0]

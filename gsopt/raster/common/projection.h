@@ -7,8 +7,10 @@
 namespace gsopt {
 
 struct Camera {
-  float R[9], t[3];  // cam_from_world, rows
-  float center[3];   // in the world
+  // cam_from_world is R (x - pivot) + t. The pivot is a round point near the camera, the origin unless that is far away:
+  // float32 differences keep their digits where float32 coordinates have few.
+  float R[9], t[3], pivot[3];
+  float center[3];  // of the camera, from the pivot
   float fx, fy, cx, cy;
   float x_min, x_max, y_min, y_max;  // bounds on t_x/t_z and t_y/t_z inside the Jacobian
   float near_plane, far_plane, eps2d;
@@ -26,6 +28,7 @@ template <class F> struct Vec3 {
 template <class F> inline Vec3<F> operator+(Vec3<F> a, Vec3<F> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <class F> inline Vec3<F> operator-(Vec3<F> a, Vec3<F> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 template <class F> inline Vec3<F> operator*(Vec3<F> a, F s) { return {a.x * s, a.y * s, a.z * s}; }
+template <class F> inline Vec3<F> operator*(Vec3<F> a, float s) { return {a.x * s, a.y * s, a.z * s}; }
 template <class F> inline F dot(Vec3<F> a, Vec3<F> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 template <class F> inline Vec3<F> cross(Vec3<F> a, Vec3<F> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
@@ -53,6 +56,7 @@ template <class F> struct Splat3D {
 
 // Everything that forward and backward both need.
 template <class F> struct Projected {
+  Vec3<F> offset;         // mean - pivot
   Vec3<F> t;              // camera space
   F iz, ux, uy, vx, vy;   // 1/t_z; t_x/t_z, t_y/t_z; the same clamped
   F qn, qw, qx, qy, qz;   // norm of the quaternion, unit quaternion
@@ -62,14 +66,16 @@ template <class F> struct Projected {
   Vec3<F> M0, M1;         // rows of J W R S: cov2d = M Mᵀ + eps2d
   F mx, my, xx, xy, yy;   // mean2d and cov2d
   F det0, det;            // determinants of M Mᵀ and of cov2d
+  Vec3<F> n;              // M0 x M1
   F opacity;              // sigmoid, times the antialiasing factor
-  F sigmoid;
+  F sigmoid, transparency;  // of the logit; 1 - sigmoid without a difference
 };
 
 template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<F>& g) {
   Projected<F> p;
   const Vec3<F> W0 = splat3<F>(cam.R), W1 = splat3<F>(cam.R + 3), W2 = splat3<F>(cam.R + 6);
-  p.t = {dot(W0, g.mean) + cam.t[0], dot(W1, g.mean) + cam.t[1], dot(W2, g.mean) + cam.t[2]};
+  p.offset = g.mean - splat3<F>(cam.pivot);
+  p.t = {dot(W0, p.offset) + cam.t[0], dot(W1, p.offset) + cam.t[1], dot(W2, p.offset) + cam.t[2]};
   p.iz = splat<F>(1.f) / p.t.z;
   p.ux = p.t.x * p.iz, p.uy = p.t.y * p.iz;
   p.mx = p.ux * cam.fx + cam.cx, p.my = p.uy * cam.fy + cam.cy;
@@ -93,11 +99,12 @@ template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<
   const F d0 = dot(p.M0, p.M0), d1 = dot(p.M1, p.M1);
   p.xx = d0 + cam.eps2d, p.yy = d1 + cam.eps2d, p.xy = dot(p.M0, p.M1);
   // det(M Mᵀ) = |M0 x M1|²: no difference of large squares, so needles keep their width.
-  const Vec3<F> n = cross(p.M0, p.M1);
-  p.det0 = dot(n, n);
+  p.n = cross(p.M0, p.M1);
+  p.det0 = dot(p.n, p.n);
   p.det = p.det0 + (d0 + d1) * cam.eps2d + cam.eps2d * cam.eps2d;
 
-  p.sigmoid = splat<F>(1.f) / (exp(splat<F>(0.f) - g.logit) + 1.f);
+  const F odds = exp(splat<F>(0.f) - g.logit);
+  p.sigmoid = splat<F>(1.f) / (odds + 1.f), p.transparency = odds * p.sigmoid;
   p.opacity = cam.antialiased ? p.sigmoid * sqrt(p.det0 / p.det) : p.sigmoid;
   return p;
 }
@@ -123,10 +130,11 @@ template <class F> struct SplatGradient {
 template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const Whitening<F>& L, const SplatGradient<F>& v) {
   // T and M of project(), whitened: dLoss/d(cov2d) is half of Lᵀ [uu uv; uv vv] L, so that L never has to be undone.
   const Vec3<F> T0 = p.T0 * L.A + p.T1 * L.B, T1 = p.T1 * L.C;
-  const Vec3<F> M0 = p.M0 * L.A + p.M1 * L.B, M1 = p.M1 * L.C;
+  // A M0 + B M1 without its difference: M1·M1 M0 - M0·M1 M1 = M1 x (M0 x M1).
+  const Vec3<F> M0 = (p.M0 * cam.eps2d + cross(p.M1, p.n)) * (L.A / p.yy), M1 = p.M1 * L.C;
   F uu = v.uu, uv = v.uv, vv = v.vv;
   Splat3D<F> out;
-  out.logit = v.log_opacity * (splat<F>(1.f) - p.sigmoid);
+  out.logit = v.log_opacity * p.transparency;
   if (cam.antialiased) {  // log opacity holds (log det0 - log det) / 2, and M Mᵀ whitened is M' M'ᵀ
     const F h = v.log_opacity, ratio = p.det / max(p.det0, splat<F>(1e-30f));
     uu = uu + h * (dot(M1, M1) * ratio - 1.f);

@@ -70,12 +70,13 @@ inline void count_stage(Pool& pool, Frame& frame, int chunks) {
   });
 }
 
-// Prefix sums: slots by Gaussian index, entries by tile and, inside a tile, by chunk.
-inline void offset_stage(Frame& frame, int chunks) {
+// Prefix sums: slots by Gaussian index, entries by tile and, inside a tile, by chunk. False when there are too many.
+inline bool offset_stage(Frame& frame, int chunks, int64_t max_entries) {
   Record* records = frame.records.as<Record>();
-  uint32_t slot = 0;
-  for (int64_t n = 0; n < frame.count; ++n) records[n].slot = slot, slot += records[n].count;
+  int64_t slot = 0;
+  for (int64_t n = 0; n < frame.count; ++n) records[n].slot = static_cast<uint32_t>(slot), slot += records[n].count;
   frame.intersections = slot;
+  if (slot > max_entries) return false;
   uint32_t *counts = frame.histogram.as<uint32_t>(), *tile_begin = frame.tile_begin.as<uint32_t>();
   uint32_t entry = 0;
   for (int tile = 0; tile < frame.tiles(); ++tile) {
@@ -87,6 +88,7 @@ inline void offset_stage(Frame& frame, int chunks) {
     }
   }
   tile_begin[frame.tiles()] = entry;
+  return true;
 }
 
 inline void fill_stage(Pool& pool, Frame& frame, int chunks) {
@@ -105,17 +107,19 @@ inline void fill_stage(Pool& pool, Frame& frame, int chunks) {
   });
 }
 
-inline void bin_stage(Pool& pool, Frame& frame) {
+// False, and no entries, when there would be more than `max_entries`.
+inline bool bin_stage(Pool& pool, Frame& frame, int64_t max_entries) {
   const int chunks = frame.visible < 4096 ? 1 : pool.threads();
   const size_t sort_bytes = sizeof(uint32_t) * kRadix * divide_up(frame.visible, kSortChunk);
   const size_t count_bytes = sizeof(uint32_t) * frame.tiles() * static_cast<size_t>(chunks);
   frame.histogram.reserve(sort_bytes > count_bytes ? sort_bytes : count_bytes);
   sort_stage(pool, frame);
   count_stage(pool, frame, chunks);
-  offset_stage(frame, chunks);
+  if (!offset_stage(frame, chunks, max_entries)) return false;
   frame.entries.reserve(sizeof(Entry) * frame.intersections);
   frame.masks.reserve(sizeof(uint32_t) * frame.intersections);
   fill_stage(pool, frame, chunks);
+  return true;
 }
 
 }  // namespace gsopt::GSOPT_ISA

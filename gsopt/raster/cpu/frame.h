@@ -116,7 +116,7 @@ struct Calibration {
 struct Kernels {
   const char* name;
   void (*project)(Pool&, Frame&, const Parameters&, int32_t* radii);
-  void (*bin)(Pool&, Frame&);
+  bool (*bin)(Pool&, Frame&, int64_t max_entries);
   void (*blend)(Pool&, Frame&, const ForwardOutput&);
   void (*blend_backward)(Pool&, Frame&, const BackwardInput&, bool absgrad);
   void (*project_backward)(Pool&, Frame&, const Parameters&, const ParameterGradients&);

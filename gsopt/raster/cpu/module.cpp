@@ -68,6 +68,7 @@ struct Workspace {
   Pool pool;
   const Kernels* kernels;
   Buffer scratch;
+  int64_t max_entries = UINT32_MAX;  // (splat, tile) pairs of one frame
   bool count_work = false;
   Work work;                              // summed over frames while count_work is set
   std::map<std::string, double> seconds;  // wall time per stage since construction
@@ -114,12 +115,18 @@ Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, i
   Camera c;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) c.R[3 * i + j] = static_cast<float>(V[4 * i + j]);
-    c.t[i] = static_cast<float>(V[4 * i + 3]);
   }
+  constexpr double kPivotGrid = 32;
   for (int j = 0; j < 3; ++j) {
-    double s = 0;
-    for (int i = 0; i < 3; ++i) s -= V[4 * i + j] * V[4 * i + 3];
-    c.center[j] = static_cast<float>(s);
+    double center = 0;
+    for (int i = 0; i < 3; ++i) center -= V[4 * i + j] * V[4 * i + 3];
+    c.pivot[j] = static_cast<float>(std::round(center / kPivotGrid) * kPivotGrid);
+    c.center[j] = static_cast<float>(center - c.pivot[j]);
+  }
+  for (int i = 0; i < 3; ++i) {
+    double t = V[4 * i + 3];
+    for (int j = 0; j < 3; ++j) t += V[4 * i + j] * c.pivot[j];
+    c.t[i] = static_cast<float>(t);
   }
   const double fx = K[0], fy = K[4], cx = K[2], cy = K[5], margin_x = kViewMargin * 0.5 * width / fx, margin_y = kViewMargin * 0.5 * height / fy;
   c.fx = static_cast<float>(fx), c.fy = static_cast<float>(fy), c.cx = static_cast<float>(cx), c.cy = static_cast<float>(cy);
@@ -155,7 +162,9 @@ void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, con
   if (frame.tiles_x > 65535 || frame.tiles_y > 65535) throw std::invalid_argument("the image is wider or higher than 1,048,560 pixels");
   reserve_frame(frame, P.count);
   timed(ws, "project", [&] { ws.kernels->project(ws.pool, frame, P, out.radii); });
-  timed(ws, "bin", [&] { ws.kernels->bin(ws.pool, frame); });
+  bool fits = true;
+  timed(ws, "bin", [&] { fits = ws.kernels->bin(ws.pool, frame, ws.max_entries); });
+  if (!fits) throw std::overflow_error("the splats cover " + std::to_string(frame.intersections) + " (splat, tile) pairs, more than " + std::to_string(ws.max_entries));
   timed(ws, "blend", [&] { ws.kernels->blend(ws.pool, frame, out); });
   for (const Work& w : work) ws.work.entries += w.entries, ws.work.pairs += w.pairs;
 }
@@ -222,6 +231,7 @@ NB_MODULE(_cpu, m) {
       .def_ro("cpu_seconds", &Workspace::cpu_seconds)
       .def("calibrate", [](const Workspace& w) { const Calibration c = w.kernels->calibrate(); return std::tuple(c.fma, c.exp); })
       .def_rw("count_work", &Workspace::count_work)
+      .def_rw("max_entries", &Workspace::max_entries)
       .def_prop_ro("work", [](const Workspace& w) { return std::tuple(w.work.entries, w.work.pairs); })
       .def_prop_ro("threads", [](const Workspace& w) { return w.pool.threads(); });
   nb::class_<Frame>(m, "Frame")

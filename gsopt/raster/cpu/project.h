@@ -23,8 +23,8 @@ inline Splat3D<f8> load_splats(const Parameters& P, const int64_t rows[kLanes]) 
   return {{f[0], f[1], f[2]}, f[3], f[4], f[5], f[6], {f[7], f[8], f[9]}, f[10]};
 }
 
-inline Vec3<f8> view_directions(const Camera& cam, const Vec3<f8>& mean, f8& inverse_distance) {
-  const Vec3<f8> d = {mean.x - cam.center[0], mean.y - cam.center[1], mean.z - cam.center[2]};
+inline Vec3<f8> view_directions(const Camera& cam, const Vec3<f8>& offset, f8& inverse_distance) {
+  const Vec3<f8> d = offset - splat3<f8>(cam.center);
   inverse_distance = splat<f8>(1.f) / sqrt(max(dot(d, d), splat<f8>(1e-30f)));
   return d * inverse_distance;
 }
@@ -54,7 +54,7 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
   const f8 lo = log2(max(p.opacity, splat<f8>(1e-37f)));
   const f8 reach = max(lo - kLog2AlphaMin, splat<f8>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
   const f8 rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
-  const i8 ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det > 0.f) &
+  const i8 ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
                 (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) & (p.my + ry > 0.f) &
                 (p.my - ry < static_cast<float>(cam.height));
   const int mask = movemask(ok) & ((1 << lanes) - 1);
@@ -63,7 +63,7 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   if (mask) {
     f8 basis[15], inv;
-    const Vec3<f8> d = view_directions(cam, g.mean, inv);
+    const Vec3<f8> d = view_directions(cam, p.offset, inv);
     sh_basis(frame.sh_degree, d.x, d.y, d.z, basis);
     for (int b = 0; b < bands; ++b) store8(Y[b], basis[b]);
     const f8 fields[8] = {p.mx, p.my, A, B, C, lo, p.t.z, p.t.z};
@@ -166,15 +166,15 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   const Projected<f8> p = project(cam, g);
   const Whitening<f8> L = whitening(p);
   // Blending measures u and v in units of sqrt(kHalfLog2E).
-  constexpr float unit = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
-  const f8 su = field[kSu] * unit, sv = field[kSv] * unit;
+  constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
+  const f8 su = field[kSu] * length, sv = field[kSv] * length;
   const SplatGradient<f8> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
                                L.A * su, L.B * su + L.C * sv, field[kWz]};
   Splat3D<f8> out = project_backward(cam, p, L, v);
 
   f8 basis[15], bx[15], by[15], bz[15], inv;
   alignas(32) float Y[15][kLanes], Yx[15][kLanes], Yy[15][kLanes], Yz[15][kLanes];
-  const Vec3<f8> d = view_directions(cam, g.mean, inv);
+  const Vec3<f8> d = view_directions(cam, p.offset, inv);
   const int degree = frame.sh_degree, bands = (degree + 1) * (degree + 1) - 1;
   sh_basis(degree, d.x, d.y, d.z, basis);
   sh_basis_gradient(degree, d.x, d.y, d.z, bx, by, bz);
@@ -214,7 +214,7 @@ inline void zero_gradient(const Parameters& P, const ParameterGradients& G, int6
   G.logit_opacities[n] = 0.f;
   G.means2d[2 * n] = G.means2d[2 * n + 1] = 0.f;
   if (G.means2d_abs) G.means2d_abs[2 * n] = G.means2d_abs[2 * n + 1] = 0.f;
-  std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
+  if (P.sh_rest) std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
 }
 
 // Gaussians that no pixel saw get zeros; the others are packed into full vectors, in index order.
