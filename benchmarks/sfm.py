@@ -49,6 +49,8 @@ def once(path: Path, function: Any, *arguments: Any) -> dict[str, Any]:
     if not path.is_file():
         with get_context("spawn").Pool(1) as pool:
             found = pool.apply(measured, (function, *arguments))
+            pool.close()
+            pool.join()
         path.write_text(json.dumps(found, indent=1))
     return json.loads(path.read_text())
 

@@ -5,7 +5,9 @@ Everything here runs on one thread: sums over several threads would give other b
 
 from __future__ import annotations
 
+import itertools
 import shutil
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +22,7 @@ SATISFIED = 0.9
 """Share of the photos below which `auto` tries the other mapper."""
 SMALLEST_MODEL = 3
 FEWEST_POINTS = 15
-"""Points a photo must see for its pose to count."""
+"""Points a photo must share with another one for its pose to count."""
 ENOUGH_FOR_CENTER = 10
 """Photos of one camera from which on the last adjustment may move its principal point."""
 
@@ -69,7 +71,7 @@ def find_poses(
     if best is None:
         return None
     adjust(pycolmap, best.reconstruction, config)
-    drop_unsupported(best.reconstruction)
+    keep_coherent(best.reconstruction)
     return best if len(best.names) >= SMALLEST_MODEL else None
 
 
@@ -91,9 +93,12 @@ def run_mapper(
         models = _incremental(pycolmap, database, photos, target, config)
     else:
         models = _global(pycolmap, database, photos, target, config)
+    for model in models:
+        keep_coherent(model)
     if mapper == "hybrid" and models and len(registered(models[0])) < len(graph.features):
         models = _repaired(pycolmap, models, database, photos, target, config)
-    return sorted(models, key=lambda model: (-model.num_reg_images(), min(registered(model))))
+    placed = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
+    return sorted(placed, key=lambda model: (-model.num_reg_images(), min(registered(model))))
 
 
 def adjust(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> None:
@@ -113,11 +118,32 @@ def adjust(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> None
     reconstruction.update_point_3d_errors()
 
 
-def drop_unsupported(reconstruction: Any) -> None:
-    """Take back the poses of photos that see too few points: a pose must be held by something."""
-    weak = [i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D < FEWEST_POINTS]
-    for image_id in weak:
+def keep_coherent(reconstruction: Any) -> None:
+    """Take back the poses of photos that no chain of shared points holds to the largest part of the reconstruction.
+
+    Global mapping places all photos of a connected view graph, also groups whose common points it lost on the way:
+    each group then stands anywhere (seen on real photos: 36, 10 and 4 of 50, without one point in common).
+    """
+    coherent = max(covisible_groups(reconstruction), key=lambda group: (len(group), -min(group)), default=set())
+    for image_id in set(reconstruction.reg_image_ids()) - coherent:
         reconstruction.deregister_frame(reconstruction.image(image_id).frame_id)
+
+
+def covisible_groups(reconstruction: Any) -> list[set[int]]:
+    """Registered photos connected by pairs that share at least FEWEST_POINTS points; those that see fewer are left out.
+
+    Pairs are counted along each point's track, which reaches every photo that sees the point.
+    """
+    shared: Counter[tuple[int, int]] = Counter()
+    for point in reconstruction.points3D.values():
+        seen_by = sorted({element.image_id for element in point.track.elements})
+        shared.update(itertools.combinations(seen_by, 2))
+    group: dict[int, set[int]] = {}
+    for (a, b), count in shared.items():
+        if count >= FEWEST_POINTS and group.setdefault(a, {a}) is not group.setdefault(b, {b}):
+            merged = group[a] | group[b]
+            group.update(dict.fromkeys(merged, merged))
+    return list({id(members): members for members in group.values()}.values())
 
 
 def incremental_options(pycolmap: ModuleType, config: SfmConfig) -> Any:
