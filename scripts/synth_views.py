@@ -108,7 +108,7 @@ def parse(arguments: Sequence[str]) -> tuple[list[items.Item], Settings, dict[st
     words = list(arguments)
     if words[-1:] != ["--lighting"] and "hdri" in words and words[words.index("hdri") - 1] == "--lighting":
         words.insert(words.index("hdri") + 1, "--hdri")  # the one flag whose choice takes a file
-    given = vars(make_parser().parse_args(words))
+    given = vars(make_parser().parse_intermixed_args(words))
     sources = [items.of_paths(given.pop("meshes"))]
     shapenet, synsets, manifest = (given.pop(name) for name in ("shapenet", "synsets", "manifest"))
     if synsets and not shapenet:

@@ -6,10 +6,14 @@ Files come from strangers. Blender's importers trust counts in headers, so each 
 from __future__ import annotations
 
 import json
+import mmap
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gsopt.errors import InputError
 
@@ -20,6 +24,20 @@ MAX_HEADER = 1 << 16
 MAX_GLTF_JSON = 256 << 20
 MAX_EXPANSION = 64
 """Most elements per byte that a compressed or zero-filled glTF accessor may unfold to."""
+PLY_TYPES = {
+    name: code
+    for code, names in {
+        "i1": (b"char", b"int8"),
+        "u1": (b"uchar", b"uint8"),
+        "i2": (b"short", b"int16"),
+        "u2": (b"ushort", b"uint16"),
+        "i4": (b"int", b"int32"),
+        "u4": (b"uint", b"uint32"),
+        "f4": (b"float", b"float32"),
+        "f8": (b"double", b"float64"),
+    }.items()
+    for name in names
+}
 COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
@@ -53,6 +71,10 @@ def too_many(mesh: Path, count: object, what: str, size: int) -> InputError:
 def check_ply(mesh: Path, size: int) -> list[str]:
     """Every element of a PLY takes at least a byte."""
     header = read_start(mesh, MAX_HEADER).split(b"end_header")[0]
+    if b"format ascii" in header:
+        check_numbers(mesh, rb"^[^a-z]*\b(?:nan|inf)")
+    else:
+        check_ply_vertices(mesh, header)
     for words in [line.split() for line in header.splitlines()]:
         if len(words) == 3 and words[0] == b"element" and not (words[2].isdigit() and int(words[2][:20]) <= size):
             raise too_many(
@@ -65,11 +87,44 @@ def check_stl(mesh: Path, size: int) -> list[str]:
     """A binary STL is an 80-byte header, a count and 50 bytes a triangle; a text STL says `facet`."""
     start = read_start(mesh, 4096)
     if start.lstrip().startswith(b"solid") and b"facet" in start:
+        check_numbers(mesh, rb"^\s*vertex\s.*\b(?:nan|inf)")
         return []
     count = struct.unpack_from("<I", start, 80)[0] if len(start) >= 84 else 0
     if 84 + 50 * count > size:
         raise too_many(mesh, count, "triangles", size)
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    if not np.isfinite(np.fromfile(mesh, record, count, offset=84)["corners"]).all():
+        raise not_finite(mesh)
     return []
+
+
+def check_numbers(mesh: Path, pattern: bytes) -> None:
+    """InputError for a NaN or an infinity in a text file: Blender's importers read it as zero."""
+    with mesh.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+        if re.search(pattern, text, re.MULTILINE | re.IGNORECASE):
+            raise not_finite(mesh)
+
+
+def not_finite(mesh: Path) -> InputError:
+    return InputError(f"{mesh} must have finite coordinates, got NaN or infinity. Repair or export it again.")
+
+
+def check_ply_vertices(mesh: Path, header: bytes) -> None:
+    """InputError for a NaN or an infinity in a binary PLY whose vertices come first, as exporters write them."""
+    order = ">" if b"binary_big_endian" in header else "<"
+    first = header.partition(b"element ")[2].partition(b"element ")[0]
+    vertex, *properties = [line.split() for line in first.splitlines()] or [[]]
+    properties = [words for words in properties if words[:1] == [b"property"]]
+    plain = all(len(words) == 3 and words[1] in PLY_TYPES for words in properties)
+    if len(vertex) != 2 or vertex[0] != b"vertex" or not vertex[1].isdigit() or not (properties and plain):
+        return
+    record = np.dtype([(str(i), order + PLY_TYPES[words[1]]) for i, words in enumerate(properties)])
+    start = len(header) + len(b"end_header") + 1
+    count = min(int(vertex[1][:20]), max(0, mesh.stat().st_size - start) // record.itemsize)
+    rows = np.fromfile(mesh, record, count, offset=start)
+    for i, words in enumerate(properties):
+        if words[2] in (b"x", b"y", b"z") and not np.isfinite(rows[str(i)]).all():
+            raise not_finite(mesh)
 
 
 def check_obj(mesh: Path, size: int) -> list[str]:
@@ -82,6 +137,7 @@ def check_obj(mesh: Path, size: int) -> list[str]:
     wanted = {b"v": 3, b"vn": 3, b"vt": 1, b"f": 3}.get(last[0] if last else b"", 0)
     if len(last) - 1 < wanted or (wanted and last[-1].endswith(b"/")):
         raise InputError(f"{mesh} breaks off in its last line ({b' '.join(last)[:40]!r}). Export or copy it again.")
+    check_numbers(mesh, rb"^[ \t]*v[ \t].*\b(?:nan|inf)")
     lines = [line.strip().decode("utf-8", "replace") for line in start.splitlines() if line.startswith(b"mtllib ")]
     lost = [name for name in (line[len("mtllib ") :].strip() for line in lines) if not find_near(mesh, name)]
     return [f"the material file {name} is missing: surfaces are plain" for name in lost]

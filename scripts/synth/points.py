@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 CANDIDATES = 4
 """Samples drawn for each point wanted: those that no view sees are dropped."""
 DEPTH_TOLERANCE = 0.01
-"""How far behind the depth map a sample may lie and count as seen, world units."""
+"""How far off the depth map a sample may lie and count as seen, world units."""
+GRAZING = 0.2
+"""A view that sees the surface at less than this cosine tells neither its color nor whether it is hidden."""
 
 
 class SurfacePoints:
@@ -38,9 +40,11 @@ class SurfacePoints:
         height, width = depth.shape
         inside = (cam[:, 2] < 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         at = row.clip(0, height - 1), column.clip(0, width - 1)
-        seen = np.nonzero(inside & (depth[at] > 0) & (np.abs(z - depth[at]) < DEPTH_TOLERANCE))[0]
+        away = shot.eye - self.xyz
+        steep = np.abs((away * self.normals).sum(axis=1)) > GRAZING * np.linalg.norm(away, axis=1)
+        seen = np.nonzero(inside & steep & (depth[at] > 0) & (np.abs(z - depth[at]) < DEPTH_TOLERANCE))[0]
         self.sums[seen] += rgba[at][seen, :3]
-        self.facing[seen] += shot.eye - self.xyz[seen]
+        self.facing[seen] += away[seen]
         self.views[seen] += 1
 
     def found(

@@ -90,19 +90,29 @@ def mend_textures(bpy: Any, mesh: Path) -> list[str]:
     """Find textures whose path is wrong; take lost ones out, so that the material's own color shows."""
     lost = []
     for image in [i for i in bpy.data.images if i.source == "FILE" and i.packed_file is None and not i.size[0]]:
-        named = image.filepath_raw or image.name
-        found = find_near(mesh, named.removeprefix("//"))
-        if found:
-            image.filepath = str(found.resolve())
-            image.reload()
-        if not image.size[0]:
-            lost.append(f"the texture {named} is {'unreadable' if found else 'missing'}: its surfaces are plain")
-            bpy.data.images.remove(image)
+        named = image.filepath_raw.removeprefix("//") or image.name
+        found = find_near(mesh, named)
+        mended = load_image(bpy, found) if found else None
+        if mended:
+            image.user_remap(mended)
+        else:
+            bare = named.replace("\\", "/").rpartition("/")[2]
+            lost.append(f"the texture {bare} is {'unreadable' if found else 'missing'}: its surfaces are plain")
+        bpy.data.images.remove(image)
     for material in bpy.data.materials:
         nodes = material.node_tree.nodes if material.node_tree else []
         for node in [n for n in nodes if n.type == "TEX_IMAGE" and n.image is None]:
             nodes.remove(node)
     return sorted(lost)
+
+
+def load_image(bpy: Any, file: Path) -> Any:
+    """An image, or None when the file holds none."""
+    try:
+        image = bpy.data.images.load(str(file.resolve()))
+    except RuntimeError:
+        return None
+    return image if image.size[0] else None
 
 
 def mend_normals(shape: Any, unshaded: bool) -> list[str]:
@@ -112,6 +122,8 @@ def mend_normals(shape: Any, unshaded: bool) -> list[str]:
     alike, and what normals the mesh had are dropped. So they are, corner by corner, where they point away from their
     face. A mesh of a kind without shading of its own and without normals becomes smooth where faces meet gently.
     """
+    if not len(shape.polygons):
+        return []
     corners = integers(shape.loops, "vertex_index")
     sizes = integers(shape.polygons, "loop_total")
     turned = winding_disagrees(corners, sizes)
@@ -126,8 +138,8 @@ def mend_normals(shape: Any, unshaded: bool) -> list[str]:
     if not shape.has_custom_normals:
         return []
     normals = vectors(shape.corner_normals, "vector")
-    faces = np.repeat(vectors(shape.polygon_normals, "vector"), sizes, axis=0)
-    wrong = ~((normals * faces).sum(axis=1) > 0.0) & (np.linalg.norm(faces, axis=1) > 0.5)
+    faces = np.repeat(area_vectors(vectors(shape.vertices, "co")[corners], sizes), sizes, axis=0)
+    wrong = ~((normals * faces).sum(axis=1) > 0.0) & faces.any(axis=1)
     if not wrong.any():
         return []
     normals[wrong] = 0.0
@@ -137,14 +149,25 @@ def mend_normals(shape: Any, unshaded: bool) -> list[str]:
 
 def winding_disagrees(corners: Int[np.ndarray, "L"], sizes: Int[np.ndarray, "F"]) -> bool:
     """True when the two faces of some edge run along it in the same direction."""
-    ends = np.repeat(np.cumsum(sizes), sizes)
-    following = np.arange(1, len(corners) + 1)
-    following = np.where(following == ends, ends - np.repeat(sizes, sizes), following)  # the last meets the first
-    edges = np.stack([corners, corners[following]], axis=1).astype(np.int64)
+    edges = np.stack([corners, corners[following_corner(sizes)]], axis=1).astype(np.int64)
     forward = edges[:, 0] < edges[:, 1]
     _, edge, faces = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     balance = np.bincount(edge.ravel(), np.where(forward, 1.0, -1.0), len(faces))
     return bool(((faces == 2) & (balance != 0)).any())
+
+
+def following_corner(sizes: Int[np.ndarray, "F"]) -> Int[np.ndarray, "L"]:
+    """The next corner around the same face, for every corner of faces of these sizes."""
+    ends = np.repeat(np.cumsum(sizes), sizes)
+    following = np.arange(1, len(ends) + 1)
+    return np.where(following == ends, ends - np.repeat(sizes, sizes), following)
+
+
+def area_vectors(corners: Float[np.ndarray, "L 3"], sizes: Int[np.ndarray, "F"]) -> Float[np.ndarray, "F 3"]:
+    """Twice the area times the normal that a face's winding gives it (Newell); Blender's own follow custom normals."""
+    starts = np.cumsum(sizes) - sizes
+    local = corners.astype(np.float64) - np.repeat(corners[starts], sizes, axis=0)
+    return np.add.reduceat(np.cross(local, local[following_corner(sizes)]), starts, axis=0)
 
 
 def wind_alike(shape: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from gsopt.errors import GsoptError, InputError
 from synth.cameras import Shot, look_at_origin
 from synth.settings import Settings
-from synth.stage import matrix_rows
+from synth.stage import load_image, matrix_rows
 
 # Position and side of the square (units of the unit sphere), power (W): key, fill, back, and a weak one from below.
 # A matte surface that faces one of power P from distance d has the radiance albedo * P / (pi * d)².
@@ -62,11 +62,8 @@ def add_lamps(bpy: Any) -> None:
 
 def add_environment(bpy: Any, file: Path, tree: Any) -> None:
     """An equirectangular image all around. InputError when it is no image."""
-    try:
-        image = bpy.data.images.load(str(file.resolve()))
-    except RuntimeError:
-        image = None
-    if image is None or not image.size[0]:
+    image = load_image(bpy, file)
+    if image is None:
         raise InputError(f"`--lighting hdri` cannot read {file}. Give an equirectangular .hdr, .exr, .png or .jpg.")
     node = tree.nodes.new("ShaderNodeTexEnvironment")
     node.image = image

@@ -1,0 +1,239 @@
+"""Laws of a whole run, with a worker that only pretends: what is kept, what is refused, what a failure leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+import synth_views
+from synth import crew, library
+from synth.crew import Job, from_json, to_json
+from synth.items import Item
+from synth.library import run
+from synth.render import PARTIAL, RECORD, new_folder
+from synth.settings import Settings
+
+from gsopt.errors import InputError, UsageError
+
+SETTINGS = Settings(views=1, resolution=(8, 8), formats=("nerf", "colmap"), elevations=(0.0, 10.0))
+
+PRETENDER = """
+    import json, os, sys, time
+    sys.path[:0] = {paths!r}
+    from synth.crew import ANSWER, from_json
+    print("Blender talks", flush=True)
+    for line in sys.stdin:
+        job = from_json(line)
+        with open({calls!r}, "a") as calls:
+            calls.write(job.item.id + "\\n")
+        text = job.item.mesh.read_text()
+        if text == "crash":
+            os._exit(11)
+        if text == "hang":
+            time.sleep(60)
+        if text == "bad":
+            print(ANSWER + json.dumps({{"error": "it is bad. Mend it."}}), flush=True)
+            continue
+        job.out.mkdir(parents=True)
+        sha = __import__("hashlib").sha256(text.encode()).hexdigest()
+        record = {{"id": job.item.id, "seed": job.seed, "mesh_sha256": sha}}
+        (job.out / "object.json").write_text(json.dumps(record))
+        print(ANSWER + json.dumps({{"seconds": {{"stage": 0.0, "render": 0.0, "write": 0.0}}}}), flush=True)
+"""
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the pretending workers note each job."""
+    script, calls = tmp_path / "pretender.py", tmp_path / "calls.txt"
+    calls.touch()
+    paths = [str(crew.SCRIPT.parent), str(crew.SCRIPT.parent.parent)]
+    script.write_text(textwrap.dedent(PRETENDER.format(paths=paths, calls=str(calls))))
+    monkeypatch.setattr(crew, "worker_command", lambda: [sys.executable, str(script)])
+    return calls
+
+
+def meshes(tmp_path: Path, **contents: str) -> list[Item]:
+    for name, text in contents.items():
+        (tmp_path / f"{name}.obj").write_text(text)
+    return [Item(name, tmp_path / f"{name}.obj", license="CC0") for name in contents]
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_one_bad_mesh_never_stops_the_run(calls: Path, tmp_path: Path) -> None:
+    items = meshes(tmp_path, a="x", b="bad", c="crash", d="hang", e="y")
+    assert run(items, SETTINGS, 0, tmp_path / "out", workers=2, time_limit=5.0) == 3
+    failures = {f["id"]: f["reason"] for f in read(tmp_path / "out" / "failures.json")}
+    assert list(failures) == ["b", "c", "d"]
+    assert "it is bad" in failures["b"]
+    assert "crashed" in failures["c"]
+    assert "5 s" in failures["d"]
+    assert [o["id"] for o in read(tmp_path / "out" / "dataset.json")["objects"]] == ["a", "e"]
+
+
+def test_resume_renders_nothing_twice_and_tries_failures_again(calls: Path, tmp_path: Path) -> None:
+    items = meshes(tmp_path, a="x", b="bad", c="y")
+    assert run(items, SETTINGS, 0, tmp_path / "out") == 3
+    before = (tmp_path / "out" / "a" / RECORD).stat().st_mtime_ns
+    meshes(tmp_path, b="mended")
+    calls.write_text("")
+    assert run(items, SETTINGS, 0, tmp_path / "out", resume=True) == 0
+    assert calls.read_text() == "b\n"
+    assert (tmp_path / "out" / "a" / RECORD).stat().st_mtime_ns == before
+    assert read(tmp_path / "out" / "failures.json") == []
+    assert [o["id"] for o in read(tmp_path / "out" / "dataset.json")["objects"]] == ["a", "b", "c"]
+
+
+def test_a_changed_mesh_is_told_and_its_views_are_kept(calls: Path, tmp_path: Path) -> None:
+    items = meshes(tmp_path, a="x")
+    run(items, SETTINGS, 0, tmp_path / "out")
+    meshes(tmp_path, a="changed")
+    assert run(items, SETTINGS, 0, tmp_path / "out", resume=True) == 3
+    assert "changed" in read(tmp_path / "out" / "failures.json")[0]["reason"]
+    assert (tmp_path / "out" / "a" / RECORD).is_file()
+
+
+def test_what_is_recorded_does_not_depend_on_the_workers(calls: Path, tmp_path: Path) -> None:
+    items = meshes(tmp_path, **{f"m{i}": str(i) for i in range(6)})
+    for workers in (1, 3):
+        run(items, SETTINGS, 4, tmp_path / str(workers), workers=workers)
+    first, second = ((tmp_path / w / "dataset.json").read_bytes() for w in ("1", "3"))
+    assert first == second
+    assert len({o["seed"] for o in json.loads(first)["objects"]}) == 6
+
+
+@pytest.mark.parametrize("held", ["another run", "the same run", "strange files", "a file"])
+def test_a_folder_that_holds_something_is_left_alone(held: str, calls: Path, tmp_path: Path) -> None:
+    out, items = tmp_path / "out", meshes(tmp_path, a="x")
+    if held == "a file":
+        out.write_text("mine")
+    elif held == "strange files":
+        out.mkdir()
+        (out / "mine.txt").write_text("mine")
+    else:
+        run(items, SETTINGS, 7 if held == "another run" else 0, out)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    with pytest.raises(InputError, match="out"):
+        run(items, SETTINGS, 0, out, resume=held != "the same run")
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+
+
+def test_what_a_killed_run_left_half_written_is_swept_away(calls: Path, tmp_path: Path) -> None:
+    items = meshes(tmp_path, a="x", b="y")
+    run(items[:1], SETTINGS, 0, tmp_path / "out")
+    (tmp_path / "out" / f"{PARTIAL}123-b").mkdir()
+    (tmp_path / "out" / f"{PARTIAL}123-b" / "half.png").touch()
+    assert run(items, SETTINGS, 0, tmp_path / "out", resume=True) == 0
+    assert not list((tmp_path / "out").rglob(PARTIAL + "*"))
+
+
+def test_an_interrupted_run_records_what_it_has(calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(text: str) -> None:
+        if text.startswith("[1/"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(library, "say", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(meshes(tmp_path, a="x", b="y", c="z"), SETTINGS, 0, tmp_path / "out")
+    monkeypatch.undo()
+    assert len(read(tmp_path / "out" / "dataset.json")["objects"]) >= 1
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+
+    def fail_halfway() -> None:
+        with new_folder(out) as folder:
+            (folder / "half").write_text("x")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_halfway()
+    assert list(out.parent.iterdir()) == []
+    with new_folder(out) as folder:
+        (folder / "all").write_text("x")
+        assert not out.exists()
+    assert [p.name for p in out.parent.rglob("*")] == ["out", "all"]
+    with pytest.raises(InputError, match="exists"), new_folder(out):
+        pytest.fail("entered an existing folder")
+    assert (out / "all").read_text() == "x"
+
+
+@pytest.mark.parametrize("blocker", ["file", "dangling link"])
+def test_nothing_in_the_way_is_replaced(blocker: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    if blocker == "file":
+        out.write_text("mine")
+    else:
+        os.symlink(tmp_path / "nowhere", out)
+    for place in (out, out / "below"):
+        with pytest.raises(InputError), new_folder(place):
+            pytest.fail("entered")
+    assert out.is_symlink() or out.read_text() == "mine"
+
+
+def test_a_job_survives_the_pipe() -> None:
+    job = Job(Item("стул 3", Path("/m/ü x.obj"), front=(0.0, 1.0)), SETTINGS, 5, Path("out/стул 3"))
+    assert from_json(to_json(job)) == job
+    assert to_json(job).isascii()
+
+
+# The command line
+
+
+def test_arguments_after_the_dashes_are_ours() -> None:
+    assert synth_views.own_arguments(["/opt/blender", "-b", "-P", "x.py", "--", "a.obj"]) == ["a.obj"]
+    assert synth_views.own_arguments(["scripts/synth_views.py", "a.obj"]) == ["a.obj"]
+    assert synth_views.own_arguments(["/opt/blender", "-b", "-P", "x.py"]) == []
+
+
+def test_command_line_reaches_the_settings(tmp_path: Path) -> None:
+    line = (
+        "a.obj -o out --views 3 --test-views 2 --val-views 1 --resolution 320x200 --fov 30 --layout orbit "
+        "--elevations 0 10 --radius 5 --lens-jitter 0.1 --samples 4 --lighting hdri sky.exr --background #102030 "
+        "--normalize cube --depth --normals --masks --position --format nerf,colmap --points 10 --captions --preview "
+        "--threads 3 --seed 4 --workers 2 --time-limit 60 --resume b.obj"
+    )
+    found, settings, how = synth_views.parse(line.split())
+    assert [item.id for item in found] == ["a", "b"]
+    assert how == {"seed": 4, "out": Path("out"), "workers": 2, "resume": True, "time_limit": 60.0}
+    assert settings == Settings(
+        views=3, test_views=2, val_views=1, resolution=(320, 200), fov=30.0, layout="orbit", elevations=(0.0, 10.0),
+        radius=5.0, lens_jitter=0.1, samples=4, lighting="hdri", hdri="sky.exr", background="#102030",
+        normalize="cube", depth=True, normals=True, masks=True, position=True, formats=("nerf", "colmap"), points=10,
+        captions=True, preview=True, threads=3,
+    )  # fmt: skip
+
+
+def test_a_limit_takes_the_first_objects(tmp_path: Path) -> None:
+    for name in ("c", "a", "b"):
+        (tmp_path / f"{name}.stl").touch()
+    found, _, _ = synth_views.parse([str(tmp_path), "-o", "out", "--limit", "2"])
+    assert [item.id for item in found] == ["a", "b"]
+
+
+@pytest.mark.parametrize("wrong", ["--limit 0", "--workers 0", "--seed -1", "--synsets 1", "--time-limit nan"])
+def test_wrong_numbers_are_usage_errors(wrong: str) -> None:
+    with pytest.raises(UsageError):
+        synth_views.parse(["a.obj", "-o", "out", *wrong.split()])
+
+
+def test_a_missing_mesh_ends_with_its_name_and_exit_code_3(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(crew.SCRIPT), "стул 3.obj", "-o", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert "стул 3" in done.stderr
+    assert "Traceback" not in done.stderr
