@@ -59,6 +59,7 @@ class ViewGraph:
 
 def extract(pycolmap: ModuleType, database: Path, photos: Sequence[Photo], masked: Masked, config: SfmConfig) -> None:
     """Features of all photos, one camera for each lens, zoom and size."""
+    pycolmap.Database.open(database).close()  # makes it
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = config.threads or -1
     options.max_image_size = config.max_size
@@ -67,10 +68,13 @@ def extract(pycolmap: ModuleType, database: Path, photos: Sequence[Photo], maske
         reader = reader_options(pycolmap, shared, config)
         if masked.masks is not None:
             reader.mask_path = masked.masks
+        names = [photo.name for photo in shared]
+        # Listed first, in order: threads that finish in any order would number the photos in any order.
+        pycolmap.import_images(database, masked.photos, pycolmap.CameraMode.SINGLE, names, reader)
         pycolmap.extract_features(
             database,
             masked.photos,
-            image_names=[photo.name for photo in shared],
+            image_names=names,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=options,

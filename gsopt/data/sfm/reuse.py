@@ -31,18 +31,16 @@ def needs_poses(data: Path) -> bool:
 def posed_scene(data: Path, folder: Path, config: SfmConfig, say: Say) -> Path:
     """FOLDER/<name>-posed with the poses of these photos: an earlier one when the photos are still the same."""
     stem = data.resolve().stem if is_video(data) else data.resolve().name
-    for number in itertools.count(1):
-        scene = folder / (f"{stem}-posed" if number == 1 else f"{stem}-posed-{number}")
-        if not scene.exists():
-            say(f"{data} has no poses: looking for them (gsopt sfm)")
-            posed = pose_photos(data, scene, config, say)
-            for line in posed.diagnosis.lines():
-                say(line)
-            return scene
-        if made_from(scene, data, config):
-            say(f"poses found earlier: {scene}")
-            return scene
-    raise AssertionError("unreachable: count() does not end")
+    names = (f"{stem}-posed" if number == 1 else f"{stem}-posed-{number}" for number in itertools.count(1))
+    scene = next(free for free in map(folder.joinpath, names) if not free.exists() or made_from(free, data, config))
+    if scene.exists():
+        say(f"poses found earlier: {scene}")
+        return scene
+    say(f"{data} has no poses: looking for them (gsopt sfm)")
+    posed = pose_photos(data, scene, config, say)
+    for line in posed.diagnosis.lines():
+        say(line)
+    return scene
 
 
 def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
