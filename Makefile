@@ -1,10 +1,13 @@
 # make demo: train on the scene that ships with gsopt and write a report.
 # make test: lint, type-check and test.   make lint: only the first two.
+# make bench: measure the kernels.   make stress, make sanitize: the slow checks of the rasterizer.
 # Each makes .venv when it is missing and installs again when pyproject.toml, constraints.txt or the C++ sources change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 RUN ?=
 TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds
+
+SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -16,13 +19,31 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint
+.PHONY: demo test lint bench stress sanitize
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
 
 test: lint
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2
+
+# Rewrites docs/performance.md and what it quotes; half an hour. Alone on the machine the wall times mean something.
+bench: $(VENV)/.for-test
+	OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json benchmarks/results/kernels.json --parts cases growth accuracy
+	$(PY) -m gsopt bench draw --json benchmarks/results/kernels.json
+	OMP_NUM_THREADS=1 $(PY) benchmarks/stress.py
+
+# The stress suite in full: five million Gaussians, 100,000 steps at each of four hostile learning rates.
+stress: $(VENV)/.for-test
+	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
+
+# The rasterizer's tests on a build that stops at the first bad address or undefined behavior. -P: not the sources' gsopt.
+sanitize: $(VENV)/.for-test
+	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
+	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" .
+	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)" \
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 PYTHONPATH=build/sanitized \
+	  $(PY) -P -m pytest tests/raster
 
 lint: $(VENV)/.for-test
 	$(PY) -m ruff check .

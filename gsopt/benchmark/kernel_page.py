@@ -87,7 +87,7 @@ def growth_parts(result: dict[str, Any]) -> list[str]:
 
 
 def growth_chart(result: dict[str, Any], what: str) -> str:
-    points = next((series["points"] for series in result["growth"] if series["what"] == what), [])
+    points: list[dict[str, Any]] = next((series["points"] for series in result["growth"] if series["what"] == what), [])
     time = [(point["size"], point["cpu_ms"]["median"]) for point in points]
     memory = [(point["size"], point["memory_mb"]) for point in points if point["memory_mb"]]
     series = [Series("CPU ms per iteration", time), Series("memory, MB", memory)]

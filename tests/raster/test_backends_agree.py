@@ -25,8 +25,10 @@ from torch import Tensor
 
 from gsopt.errors import UsageError
 from gsopt.gaussians import PARAMETERS
+from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
+from gsopt.raster.cpu_backend import ISA_VARIABLE
 from gsopt.raster.reference import ReferenceBackend, extents, project
 
 ORACLE = ReferenceBackend()
@@ -215,17 +217,49 @@ def test_adam(backend: Backend, shape: tuple[int, ...]) -> None:
             assert float((got - expected).abs().sum()) <= ADAM * scale
 
 
-def test_the_number_of_threads_changes_no_bit() -> None:
+@pytest.mark.parametrize("isa", _cpu.instruction_sets())
+def test_neither_the_number_of_threads_nor_a_repetition_changes_a_bit(
+    isa: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(ISA_VARIABLE, isa)
     case = single(make_case(5, count=200, width=67, height=35))
-    target = images(35, 67)[1]
-    results = []
-    for threads in (1, 3):
+    first = everything(built("cpu", 1), case)
+    for threads in (1, 2, 3, 4, 7, 8, 16):
         engine = built("cpu", threads)
-        frame = draw(engine, case)
-        gradients = engine.backward(frame, *(v.float() for v in weights_like(case)), absgrad=True)
-        photometric = engine.photometric(frame.colors, target, 0.2)
-        tensors = [frame.colors, frame.alphas, frame.radii, photometric.v_colors]
-        tensors += [getattr(gradients, field.name) for field in fields(Gradients)]
-        results.append((tensors, photometric.loss))
-    assert results[0][1] == results[1][1]
-    assert all(torch.equal(one, three) for one, three in zip(results[0][0], results[1][0], strict=True))
+        for _ in range(2):
+            again = everything(engine, case)
+            assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True)), threads
+
+
+def everything(engine: Backend, case: Case) -> list[Tensor]:
+    """All that a step computes."""
+    frame = draw(engine, case)
+    assert frame.depths is not None
+    gradients = engine.backward(frame, *(v.float() for v in weights_like(case)), absgrad=True)
+    loss = engine.photometric(frame.colors, images(35, 67)[1], 0.2)
+    tensors = [frame.colors, frame.alphas, frame.depths, frame.radii, loss.v_colors, torch.tensor([loss.l1, loss.ssim])]
+    return tensors + [getattr(gradients, field.name) for field in fields(Gradients)]
+
+
+@pytest.mark.parametrize("isa", _cpu.instruction_sets())
+def test_every_instruction_set_draws_the_reference(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(ISA_VARIABLE, isa)
+    engine = built("cpu")
+    assert engine.isa == isa  # type: ignore[attr-defined]
+    for seed, setting in enumerate((RasterSettings(), RasterSettings(antialiased=True))):
+        case = make_case(5 + seed, count=150, width=45, height=35, settings=setting)
+        check_gradients(*both_gradients(engine, case), floor=0)
+
+
+def test_the_depths_and_alphas_alone_are_differentiated_as_by_the_reference(backend: Backend) -> None:
+    case = make_case(8, count=30)
+    decided = ~undecided_pixels(case, DECISION)
+    none, v_alphas, v_depths = (v * decided.view(*decided.shape, *[1] * (v.dim() - 2)) for v in weights_like(case))
+    for weights in ((0 * none, v_alphas, None), (0 * none, None, v_depths)):
+        truth = ORACLE.backward(draw(ORACLE, case), *weights)
+        got = backend.backward(draw(backend, single(case)), *(None if v is None else v.float() for v in weights))
+        for name in PARAMETERS:
+            mine, true = getattr(got, name), getattr(truth, name)
+            error = float(torch.linalg.vector_norm(mine - true))
+            assert error <= GRADIENT * float(torch.linalg.vector_norm(true)), name
+        assert float(got.sh0.abs().max()) == 0
