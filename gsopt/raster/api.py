@@ -106,6 +106,6 @@ def _validate(gaussians: Gaussians, cameras: Cameras, background: Tensor | None)
         check.shape("background", background, (3,))
         check.finite("background", background)
     doubles = [*gaussians.items(), ("viewmats", cameras.viewmats), ("Ks", cameras.Ks), ("background", background)]
-    for name, tensor in doubles:
-        if tensor is not None and tensor.dtype == torch.float64:  # kernels read it as float32, where 1e39 is infinite
-            check.finite(name, tensor, FLOAT32_MAX)
+    for name, value in doubles:
+        if value is not None and value.dtype == torch.float64:  # kernels read it as float32, where 1e39 is infinite
+            check.finite(name, value, FLOAT32_MAX)

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -223,7 +224,7 @@ def _scene_name(path: Path, kind: str, has_alpha: bool, taken: set[str]) -> str:
 
 
 def _save(image: Image.Image, path: Path) -> None:
-    options = {"quality": 97, "subsampling": 0} if path.suffix == ".jpg" else {"compress_level": 3}
+    options: dict[str, Any] = {"quality": 97, "subsampling": 0} if path.suffix == ".jpg" else {"compress_level": 3}
     image.save(path, exif=Image.Exif(), **options)
     os.chmod(path, 0o644)
 
