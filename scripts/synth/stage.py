@@ -44,7 +44,7 @@ def stage_mesh(bpy: Any, mesh: Path, normalize: str) -> Staged:
         bpy.data.objects.remove(other)
     warnings += mend_textures(bpy, mesh)
     for shape in bpy.data.meshes:
-        warnings += mend_normals(shape, mesh.suffix.lower() in UNSHADED)
+        warnings += mend_normals(bpy, shape, mesh.suffix.lower() in UNSHADED)
         if not any(shape.materials):
             shape.materials.append(plain_material(bpy, shape))
     imported = world_triangles(bpy)
@@ -115,12 +115,12 @@ def load_image(bpy: Any, file: Path) -> Any:
     return image if image.size[0] else None
 
 
-def mend_normals(shape: Any, unshaded: bool) -> list[str]:
-    """Normals that would shade black are computed anew; what was done, for the record.
+def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> list[str]:
+    """Normals that would shade black are replaced; what was done, for the record.
 
     Neighbors that wind opposite ways (ShapeNet stores faces from both sides, importers keep one at random) are turned
-    alike, and what normals the mesh had are dropped. So they are, corner by corner, where they point away from their
-    face. A mesh of a kind without shading of its own and without normals becomes smooth where faces meet gently.
+    alike, and what normals the mesh had are dropped. A corner whose normal points away from its face takes the face's.
+    A mesh of a kind without shading of its own and without normals becomes smooth where faces meet gently.
     """
     if not len(shape.polygons):
         return []
@@ -131,7 +131,8 @@ def mend_normals(shape: Any, unshaded: bool) -> list[str]:
         wind_alike(shape)
     if turned or (unshaded and not shape.has_custom_normals):
         if shape.has_custom_normals:
-            shape.normals_split_custom_set(np.zeros((len(shape.loops), 3)).tolist())  # zero stands for "compute it"
+            with bpy.context.temp_override(mesh=shape):
+                bpy.ops.mesh.customdata_custom_splitnormals_clear()
         shape.polygons.foreach_set("use_smooth", np.ones(len(shape.polygons), bool))
         shape.set_sharp_from_angle(angle=SMOOTH_BELOW)
         return ["faces wound both ways: turned alike, normals computed anew"] if turned else []
@@ -142,9 +143,9 @@ def mend_normals(shape: Any, unshaded: bool) -> list[str]:
     wrong = ~((normals * faces).sum(axis=1) > 0.0) & faces.any(axis=1)
     if not wrong.any():
         return []
-    normals[wrong] = 0.0
+    normals[wrong] = faces[wrong] / np.linalg.norm(faces[wrong], axis=1, keepdims=True)
     shape.normals_split_custom_set(normals.tolist())
-    return [f"{int(wrong.sum())} of {len(wrong)} normals pointed away from their face and were computed anew"]
+    return [f"{int(wrong.sum())} of {len(wrong)} normals pointed away from their face and took its own"]
 
 
 def winding_disagrees(corners: Int[np.ndarray, "L"], sizes: Int[np.ndarray, "F"]) -> bool:
