@@ -120,7 +120,9 @@ def _write_view(view: View, found: Path, scene: Path, name: str) -> str:
     if pixels.shape[2] == 4:
         name = Path(name).stem + ".png"
     path = scene / "images" / name
-    options: dict[str, Any] = {"compress_level": 3} if path.suffix == ".png" else {"quality": JPEG_QUALITY, "subsampling": 0}
+    options: dict[str, Any] = (
+        {"compress_level": 3} if path.suffix == ".png" else {"quality": JPEG_QUALITY, "subsampling": 0}
+    )
     Image.fromarray(pixels).save(path, **options)
     return name
 
