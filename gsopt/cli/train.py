@@ -152,6 +152,7 @@ def judge(config: settings.TrainConfig, result: TrainResult, console: RunConsole
         console.say(f"trained in {clock(result.train_seconds)}; judging {result.run / 'splat.ply'}")
         facts = {
             "train_seconds": round(result.train_seconds, 3),
+            "train_cpu_seconds": round(result.cpu_seconds, 3),
             "peak_memory_mb": None if result.peak_memory_mb is None else round(result.peak_memory_mb, 1),
             "n_gaussians": len(result.gaussians),
             "steps": result.steps,

@@ -50,6 +50,8 @@ class TrainResult:
     """True when someone asked it to stop before it was finished."""
     train_seconds: float
     """Wall time of the steps, checkpoints and previews; without reading the data and making the first Gaussians."""
+    cpu_seconds: float
+    """CPU time of all threads over the same stretch: what other work on the machine does not add to."""
     peak_memory_mb: float | None
     """Largest resident set of this process since it started, interpreter and libraries included; None on Windows."""
 
@@ -72,10 +74,9 @@ def train(
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
             guidance = start_guidance(config, scene, backend, directory)
-            trainer, seconds = _start(config, scene, backend, directory, guidance)
-            clock = Clock(trainer.step, seconds)
+            trainer, clock = _start(config, scene, backend, directory, guidance)
             stopped = _advance(trainer, directory, stop, clock)
-            _finish(trainer, directory, clock.seconds())
+            _finish(trainer, directory, clock)
             if guidance is not None:
                 guidance.finish(trainer.model.gaussians, trainer.settings())
         if stopped or done:
@@ -90,6 +91,7 @@ def train(
             steps=trainer.step,
             stopped=stopped,
             train_seconds=clock.seconds(),
+            cpu_seconds=clock.cpu_seconds(),
             peak_memory_mb=peak_memory_mb(),
         )
 
@@ -110,15 +112,23 @@ def one_torch_thread() -> Iterator[None]:
 
 
 class Clock:
-    """Wall time of a run, over all its sessions, and its recent speed."""
+    """Wall and CPU time of a run, over all its sessions, and its recent speed."""
 
-    def __init__(self, step: int, seconds: float) -> None:
+    def __init__(self, step: int, seconds: float, cpu_seconds: float) -> None:
         self._began = time.perf_counter() - seconds
+        self._cpu_began = time.process_time() - cpu_seconds
         self._told, self._told_step = time.perf_counter(), step
         self._rate = 0.0
 
     def seconds(self) -> float:
         return time.perf_counter() - self._began
+
+    def cpu_seconds(self) -> float:
+        return time.process_time() - self._cpu_began
+
+    def spent(self) -> dict[str, float]:
+        """What a checkpoint keeps, for the next session to go on from."""
+        return {"seconds": self.seconds(), "cpu_seconds": self.cpu_seconds()}
 
     def is_due(self) -> bool:
         """Whether progress was last told long enough ago."""
@@ -135,8 +145,8 @@ class Clock:
 
 def _start(
     config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory, guidance: RunGuidance | None
-) -> tuple[Trainer, float]:
-    """A trainer at step 0 or at the newest checkpoint, and the seconds already spent."""
+) -> tuple[Trainer, Clock]:
+    """A trainer at step 0 or at the newest checkpoint, and the time already spent."""
     names = [view.name for view in scene.train]
     checkpoint = load_newest(directory.checkpoints, directory.warn)
     if checkpoint is None:
@@ -145,12 +155,12 @@ def _start(
         if len(gaussians) == 0:
             raise InputError(f"`{init}` made no Gaussians. Choose another --init.")
         directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin))
-        trainer, seconds = Trainer(config, scene, gaussians, backend, guidance), 0.0
+        trainer, spent = Trainer(config, scene, gaussians, backend, guidance), (0.0, 0.0)
     else:
         if names != directory.recorded("train_views"):
             raise InputError(f"{config.data.path} has other views than when the run began. Start in another folder.")
         trainer = Trainer.resumed(config, scene, backend, checkpoint, guidance)
-        seconds = float(checkpoint.meta.get("seconds", 0.0))
+        spent = (float(checkpoint.meta.get("seconds", 0.0)), float(checkpoint.meta.get("cpu_seconds", 0.0)))
     directory.emit(
         "started",
         total=config.iterations,
@@ -166,7 +176,7 @@ def _start(
     )
     for warning in scene.warnings:
         directory.warn(warning)
-    return trainer, seconds
+    return trainer, Clock(trainer.step, *spent)
 
 
 def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:
@@ -180,7 +190,7 @@ def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock
         if trainer.step % GUARD_EVERY == 0:
             _guard(trainer, directory)
         if is_due(trainer.step, config.checkpoint_every):
-            _save(trainer, directory, clock.seconds())
+            _save(trainer, directory, clock)
         if is_due(trainer.step, config.preview_every):
             _preview(trainer, directory)
         if clock.is_due() or trainer.step == config.iterations or trainer.finished_early:
@@ -192,17 +202,17 @@ def is_due(step: int, every: int) -> bool:
     return every > 0 and step % every == 0
 
 
-def _finish(trainer: Trainer, directory: RunDirectory, seconds: float) -> None:
+def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
-    _save(trainer, directory, seconds)
+    _save(trainer, directory, clock)
     save_splats(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.config.antialiased)
 
 
-def _save(trainer: Trainer, directory: RunDirectory, seconds: float) -> None:
+def _save(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """A checkpoint, never of numbers that are no longer numbers."""
     _guard(trainer, directory)
     tensors, meta = trainer.state()
-    save_checkpoint(directory.checkpoints, trainer.step, tensors, {**meta, "seconds": seconds})
+    save_checkpoint(directory.checkpoints, trainer.step, tensors, {**meta, **clock.spent()})
 
 
 def _preview(trainer: Trainer, directory: RunDirectory) -> None:
@@ -227,6 +237,7 @@ def _tell(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
         steps_per_second=round(rate, 3),
         eta_seconds=round(left / rate, 1) if rate > 0 else None,
         seconds=round(clock.seconds(), 3),
+        cpu_seconds=round(clock.cpu_seconds(), 3),
     )
 
 
