@@ -1,10 +1,14 @@
 """prompts.json: what an expert, a template or a language model says about an object. No torch, no package.
 
-    {"version": 1, "prompts": [{"text": "a worn oak chair", "weight": 1.0, "view": "all", "polarity": "positive",
-                                "source": "user", "rationale": "", "score": null}]}
+    {"version": 1, "notes": "femur, osteoporotic, CT", "object": "femur", "domain": "medicine", "reviewed": false,
+     "made": {"source": "template", "template": "medicine", "raw": "", "warnings": []},
+     "prompts": [{"text": "a worn oak chair", "weight": 1.0, "view": "all", "polarity": "positive",
+                  "source": "user", "rationale": "", "score": null}],
+     "images": [{"file": "prompts-images/01.png", "prompt": "a worn oak chair", "source": "sd21", "accepted": false}]}
 
-Everything but `text` may be left out. The file is untrusted: bounded in size and number, unknown keys refused by name,
-no control characters in the texts.
+`version`, `prompts` and the `text` of each are needed, all else may be left out; prompts.schema.json beside this module
+says the same as JSON Schema. The file is untrusted: bounded in size and number, unknown keys refused by name, no
+control characters in the texts, no path that leaves the file's folder.
 """
 
 from __future__ import annotations
@@ -13,10 +17,10 @@ import json
 import math
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
@@ -28,11 +32,17 @@ MOST_PROMPTS = 256
 LONGEST_TEXT = 1000
 """Characters of a prompt. CLIP reads 77 tokens, about 300 characters."""
 LONGEST_RATIONALE = 4000
+LONGEST_NOTES = 4000
+LONGEST_NAME = 200
 LARGEST_WEIGHT = 1000.0
+MOST_IMAGES = 64
+MOST_WARNINGS = 64
 
 View = Literal["all", "front", "side", "back", "top"]
 Polarity = Literal["positive", "negative"]
 SOURCE = re.compile(r"user|template|llm:[^\s<>]{1,200}")
+FILE = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+"""A file beside prompts.json or one folder below it."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +72,81 @@ class Prompt:
             _require_number(self.score, "score", -1.0, 1.0)
         _require_one_of(self.view, "view", get_args(View))
         _require_one_of(self.polarity, "polarity", get_args(Polarity))
-        if not isinstance(self.source, str) or not SOURCE.fullmatch(self.source):
-            raise InputError(
-                f"`source` of a prompt must be user, template or llm:MODEL, got {self.source!r}. Correct it."
-            )
+        _require_source(self.source)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A reference image that a text-to-image model made from a prompt."""
+
+    file: str
+    """PNG, relative to the folder of prompts.json, at most one folder below."""
+    prompt: str = ""
+    source: str = ""
+    """The prior that made it."""
+    accepted: bool = False
+    """Only pictures that the expert accepted guide anything."""
+
+    def __post_init__(self) -> None:
+        _require_file(self.file, "file")
+        _require_text(self.prompt, "prompt", LONGEST_TEXT)
+        _require_text(self.source, "source", LONGEST_NAME)
+        _require_bool(self.accepted, "accepted")
+
+
+@dataclass(frozen=True)
+class Made:
+    """How the prompts came to be."""
+
+    source: str = "user"
+    """user, template or llm:MODEL: what was asked. Each prompt has its own source."""
+    template: str = ""
+    """Name of the template."""
+    raw: str = ""
+    """File with the model's answers as they came, beside prompts.json."""
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _require_source(self.source)
+        _require_text(self.template, "template", LONGEST_NAME)
+        if self.raw:
+            _require_file(self.raw, "raw")
+        if not isinstance(self.warnings, (tuple, list)) or len(self.warnings) > MOST_WARNINGS:
+            raise InputError(f"`warnings` must be a list of at most {MOST_WARNINGS} texts. Remove some.")
+        for warning in self.warnings:
+            _require_text(warning, "warnings", LONGEST_RATIONALE)
+        object.__setattr__(self, "warnings", tuple(self.warnings))
+
+
+@dataclass(frozen=True)
+class PromptSet:
+    """All of a prompts.json."""
+
+    prompts: tuple[Prompt, ...] = ()
+    notes: str = ""
+    """The expert's own words."""
+    object: str = ""
+    """What the thing is, in a noun or two: every prompt of a model keeps it."""
+    domain: str = ""
+    reviewed: bool = False
+    """Whether an expert has looked at every prompt."""
+    made: Made | None = None
+    images: tuple[Picture, ...] = ()
+
+    def __post_init__(self) -> None:
+        _require_text(self.notes, "notes", LONGEST_NOTES)
+        _require_text(self.object, "object", LONGEST_NAME)
+        _require_text(self.domain, "domain", LONGEST_NAME)
+        _require_bool(self.reviewed, "reviewed")
 
 
 def read_prompts(path: Path) -> tuple[Prompt, ...]:
     """The prompts of a file, in its order. Raises InputError that names the file, the prompt and what is wrong."""
+    return read_set(path).prompts
+
+
+def read_set(path: Path) -> PromptSet:
+    """The whole file. Raises InputError that names the file, the entry and what is wrong."""
     try:
         with open(path, "rb") as file:
             data = file.read(LARGEST_FILE + 1)
@@ -79,20 +156,37 @@ def read_prompts(path: Path) -> tuple[Prompt, ...]:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"Cannot read the prompts in {path}: {error}. Write them with `gsopt prompts`.") from error
     try:
-        return prompts_from(document)
+        return set_from(document)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
 def prompts_from(document: Any) -> tuple[Prompt, ...]:
     """The prompts of a parsed prompts.json; InputError when it does not follow the schema."""
+    return set_from(document).prompts
+
+
+def set_from(document: Any) -> PromptSet:
+    """A parsed prompts.json; InputError when it does not follow the schema."""
     if not isinstance(document, dict) or not isinstance(document.get("prompts"), list):
         raise InputError('An object with a list `prompts` is needed. Write {"version": 1, "prompts": [...]}.')
-    if document.get("version") != VERSION:
-        raise InputError(f"Version {document.get('version')!r} of prompts is not known, only {VERSION}. Update gsopt.")
+    version = document.get("version")
+    if version != VERSION or isinstance(version, bool):
+        raise InputError(f"Version {version!r:.80} of prompts is not known, only {VERSION}. Update gsopt.")
+    _require_known(document, ("version", *_names(PromptSet)), "The file")
+    images = document.get("images", [])
     if len(document["prompts"]) > MOST_PROMPTS:
         raise InputError(f"At most {MOST_PROMPTS} prompts are read, got {len(document['prompts'])}. Remove some.")
-    return tuple(_prompt(values, number) for number, values in enumerate(document["prompts"]))
+    if not isinstance(images, list) or len(images) > MOST_IMAGES:
+        raise InputError(f"`images` must be a list of at most {MOST_IMAGES} pictures. Remove some.")
+    made = document.get("made")
+    plain = {name: document[name] for name in ("notes", "object", "domain", "reviewed") if name in document}
+    return PromptSet(
+        prompts=tuple(_entry(Prompt, values, f"Prompt {i}", "text") for i, values in enumerate(document["prompts"])),
+        images=tuple(_entry(Picture, values, f"Image {i}", "file") for i, values in enumerate(images)),
+        made=None if made is None else _entry(Made, made, "`made`", "source"),
+        **plain,
+    )
 
 
 def prompts_document(prompts: Iterable[Prompt]) -> dict[str, Any]:
@@ -100,44 +194,86 @@ def prompts_document(prompts: Iterable[Prompt]) -> dict[str, Any]:
     return {"version": VERSION, "prompts": [asdict(prompt) for prompt in prompts]}
 
 
+def set_document(everything: PromptSet) -> dict[str, Any]:
+    """JSON-ready; `set_from` is its inverse."""
+    values = asdict(everything)
+    first = {name: values[name] for name in ("notes", "object", "domain", "reviewed", "made")}
+    return {"version": VERSION, **first, "prompts": list(values["prompts"]), "images": list(values["images"])}
+
+
 def write_prompts(path: Path, prompts: Iterable[Prompt]) -> None:
     """A whole prompts.json or nothing."""
     write_atomic(path, to_json(prompts_document(prompts)))
 
 
-def _prompt(values: Any, number: int) -> Prompt:
-    if not isinstance(values, dict) or "text" not in values:
-        raise InputError(f"Prompt {number} must be an object with a `text`, got {values!r:.80}. Correct it.")
-    known = [field.name for field in fields(Prompt)]
+def write_set(path: Path, everything: PromptSet) -> None:
+    """A whole prompts.json or nothing."""
+    write_atomic(path, to_json(set_document(everything)))
+
+
+def accepted_images(path: Path) -> tuple[Path, ...]:
+    """Paths of the reference images that the expert accepted. InputError for a file that breaks the schema."""
+    return tuple(path.parent / picture.file for picture in read_set(path).images if picture.accepted)
+
+
+_T = TypeVar("_T")
+
+
+def _entry(kind: Callable[..., _T], values: Any, name: str, needed: str) -> _T:
+    if not isinstance(values, dict) or needed not in values:
+        raise InputError(f"{name} must be an object with a `{needed}`, got {values!r:.80}. Correct it.")
+    _require_known(values, _names(kind), name)
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+
+
+def _names(kind: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
+
+
+def _require_known(values: dict[str, Any], known: tuple[str, ...], name: str) -> None:
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise InputError(f"Prompt {number} has the unknown key `{unknown[0]}`. Known keys: {', '.join(known)}.")
-    try:
-        return Prompt(**values)
-    except InputError as error:
-        raise InputError(f"Prompt {number}: {error}") from error
+        raise InputError(f"{name} has the unknown key `{unknown[0]:.80}`. Known keys: {', '.join(known)}.")
 
 
 def _require_text(value: Any, name: str, longest: int) -> None:
     if not isinstance(value, str):
-        raise InputError(f"`{name}` of a prompt must be text, got {value!r:.80}. Put it in quotes.")
+        raise InputError(f"`{name}` must be text, got {value!r:.80}. Put it in quotes.")
     if len(value) > longest:
-        raise InputError(
-            f"`{name}` of a prompt may have {longest} characters, got {len(value)} ({value[:30]!r}...). Shorten it: "
-            "CLIP reads 77 tokens."
-        )
+        raise InputError(f"`{name}` may have {longest} characters, got {len(value)} ({value[:30]!r}...). Shorten it.")
     control = next((c for c in value if unicodedata.category(c) in ("Cc", "Cs") and c not in "\n\t"), None)
     if control is not None:
-        raise InputError(f"`{name}` of a prompt holds the control character {control!r}. Remove it.")
+        raise InputError(f"`{name}` holds the control character {control!r}. Remove it.")
 
 
 def _require_number(value: Any, name: str, low: float, high: float) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"`{name}` of a prompt must be a number, got {value!r:.80}. Correct it.")
+        raise InputError(f"`{name}` must be a number, got {value!r:.80}. Correct it.")
     if not low <= value <= high:
-        raise InputError(f"`{name}` of a prompt must lie in [{low:g}, {high:g}], got {value}. Correct it.")
+        raise InputError(f"`{name}` must lie in [{low:g}, {high:g}], got {value}. Correct it.")
 
 
 def _require_one_of(value: Any, name: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise InputError(f"`{name}` of a prompt must be one of {', '.join(allowed)}; got {value!r:.80}. Pick one.")
+        raise InputError(f"`{name}` must be one of {', '.join(allowed)}; got {value!r:.80}. Pick one.")
+
+
+def _require_source(value: Any) -> None:
+    if not isinstance(value, str) or not SOURCE.fullmatch(value):
+        raise InputError(f"`source` of a prompt must be user, template or llm:MODEL, got {value!r:.80}. Correct it.")
+
+
+def _require_file(value: Any, name: str) -> None:
+    if not isinstance(value, str) or not FILE.fullmatch(value):
+        raise InputError(
+            f"`{name}` must name a file beside prompts.json or one folder below, got {value!r:.80}. Letters, digits, "
+            "dots, - and _ may be used."
+        )
+
+
+def _require_bool(value: Any, name: str) -> None:
+    if not isinstance(value, bool):
+        raise InputError(f"`{name}` must be true or false, got {value!r:.80}. Correct it.")
