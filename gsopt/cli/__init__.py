@@ -18,6 +18,7 @@ VERBS = {
     "eval": "judge a finished run by its held-out views",
     "export": "write splats in another format",
     "view": "look at a run or a splat file in the browser",
+    "finetune": "train a diffusion prior on scenes of your own",
     "bench": "measure gsopt on this machine",
     "demo": "train on the small scene that ships with gsopt",
     "doctor": "say what is installed, what is missing and how fast this machine is",

@@ -32,7 +32,7 @@ class DiffusersPrior:
     """See `gsopt.sds.prior.Prior`."""
 
     x0_limit: float | None = None
-    pixel_exact = False
+    aligned = False
 
     def __init__(self, folder: DiffusersFolder, config: GuidanceConfig) -> None:
         self.folder = folder

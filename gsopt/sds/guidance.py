@@ -15,11 +15,12 @@ from gsopt.data.scene import Scene
 from gsopt.errors import NumericalError
 from gsopt.gaussians import Gaussians
 from gsopt.guidance_config import GuidanceConfig
+from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.sds import coverage, policies, schedule
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.noise import Latents, generator
-from gsopt.sds.prior import Condition, Images, Pair, Prior, Scale
+from gsopt.sds.prior import Condition, Images, Pair, Prior, References, Scale
 from gsopt.sds.views import draw_candidate, make_rig, nearest, square_views
 
 COVERAGE_EVERY = 100
@@ -57,6 +58,20 @@ class Sample:
     x0: Latents | None
     """The prior's estimate in its own space; None where `target` is it."""
     target: Float[Tensor, "3 S S"] | None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A render that is to be judged, and what is known about it."""
+
+    camera: Cameras
+    images: Images
+    """One, 0..1."""
+    alphas: Float[Tensor, "S S"]
+    weights: Float[Tensor, "S S"]
+    """Its uncertainty."""
+    depth: Float[Tensor, "S S"] | None = None
+    references: References | None = None
 
 
 @dataclass
@@ -147,11 +162,17 @@ class Guide:
         assert self.memory.coverage is not None
         moved = None if self.config.policy == "recon" else self._random(step, index, "jitter")
         camera = self.rig.camera(index, moved)
-        frame = self.backend.forward(gaussians, camera, settings, self._background(step))
+        frame = self.backend.forward(gaussians, camera, settings, self._background(step), depth=self.prior.aligned)
         u = coverage.uncertainty(self.memory.coverage)
-        weights = coverage.uncertainty_map(gaussians, u, camera, self.backend)
-        images = frame.colors.detach().permute(2, 0, 1)[None]
-        v_images = self.weight * self.pull(step, index, camera, images, frame.alphas.detach(), weights)
+        seen = Seen(
+            camera=camera,
+            images=frame.colors.detach().permute(2, 0, 1)[None],
+            alphas=frame.alphas.detach(),
+            weights=coverage.uncertainty_map(gaussians, u, camera, self.backend),
+            depth=None if frame.depths is None else expected_depth(frame.depths.detach(), frame.alphas.detach()),
+            references=self._references(gaussians, camera),
+        )
+        v_images = self.weight * self.pull(step, index, seen)
         if not bool(torch.isfinite(v_images).all()):
             raise NumericalError(
                 f"The gradient of the guidance in step {step} is not finite. Choose --guidance.dtype float32."
@@ -161,25 +182,26 @@ class Guide:
             getattr(gradients, name).mul_(self.config.geometry)
         return gradients
 
-    def pull(
-        self,
-        step: int,
-        index: int,
-        camera: Cameras,
-        images: Images,
-        alphas: Float[Tensor, "S S"],
-        weights: Float[Tensor, "S S"],
-    ) -> Images:
+    def _references(self, gaussians: Gaussians, camera: Cameras) -> References | None:
+        """The input views nearest to a camera, with the depth of the current Gaussians in them."""
+        chosen = nearest(self.references, camera, self.config.references)
+        if chosen is None or not self.prior.aligned:
+            return chosen
+        depths = [depth_in(gaussians, chosen.cameras[k], self.backend) for k in range(len(chosen.cameras))]
+        return replace(chosen, depths=torch.stack(depths))
+
+    def pull(self, step: int, index: int, seen: Seen) -> Images:
         """dL/d(images) of the policy's loss, lambda left out."""
+        images, weights = seen.images, seen.weights
         if self.config.policy == "recon":
-            target = self._target(step, index, camera, images, alphas)
+            target = self._target(step, index, seen)
             g = policies.pixel_pull(images, target)
             self._remember(step, index, "", images, weights, None, target[0])
             return 2 * weights * g / g.numel()  # z = 2x - 1
         with torch.enable_grad():
             leaf = images.clone().requires_grad_()
             z = self.prior.encode(leaf)
-        drawn, look = self._look(step, index, camera, images, alphas, z)
+        drawn, look = self._look(step, index, seen, z)
         if self.config.policy == "sdi":
             pull = policies.sdi(self.prior, z, look, self.config.inversion_steps)
         else:
@@ -189,13 +211,13 @@ class Guide:
         (v_images,) = torch.autograd.grad(z, leaf, policies.resized(weights, z) * pull.g)
         return v_images / z.numel()
 
-    def _target(self, step: int, index: int, camera: Cameras, images: Images, alphas: Float[Tensor, "S S"]) -> Images:
+    def _target(self, step: int, index: int, seen: Seen) -> Images:
         """recon's target for a candidate: denoised anew when it is too old, rounded to what a checkpoint keeps."""
         memory = self.memory
         if index not in memory.targets or step - memory.target_steps[index] >= self.config.refresh_every:
             with torch.no_grad():
-                z = self.prior.encode(images)
-                _, look = self._look(step, index, camera, images, alphas, z)
+                z = self.prior.encode(seen.images)
+                _, look = self._look(step, index, seen, z)
                 target = self.prior.decode(policies.denoised(self.prior, z, look, self.config.denoise_steps))
             if not bool(torch.isfinite(target).all()):
                 raise NumericalError(
@@ -205,21 +227,21 @@ class Guide:
             memory.target_steps[index] = step
         return memory.targets[index][None].float() / 255
 
-    def _look(
-        self, step: int, index: int, camera: Cameras, images: Images, alphas: Float[Tensor, "S S"], z: Latents
-    ) -> tuple[str, policies.Look]:
+    def _look(self, step: int, index: int, seen: Seen, z: Latents) -> tuple[str, policies.Look]:
         """This step's noise level, noise and conditions, and the text among the latter."""
         random = self._random(step, index, "noise")
         least, most = schedule.noise_range(step, self.config, self.iterations)
         share = least + (most - least) * float(torch.rand(1, generator=random, dtype=torch.float64))
-        side = self.rig.side(camera, self._front_known())
+        side = self.rig.side(seen.camera, self._front_known())
         drawn = self.conditioning.draw(side, self._random(step, index, "prompt"))
         positive = Condition(
             tokens=drawn.positive,
             class_embedding=drawn.class_embedding,
-            render=torch.cat([images[0].clamp(0, 1), alphas[None]]),
-            camera=camera,
-            references=nearest(self.references, camera, self.config.references),
+            render=torch.cat([seen.images[0].clamp(0, 1), seen.alphas[None]]),
+            depth=seen.depth,
+            uncertainty=seen.weights,
+            camera=seen.camera,
+            references=seen.references,
         )
         negative = replace(positive, tokens=drawn.negative, class_embedding=None, references=None)
         return drawn.text, policies.Look(
@@ -287,3 +309,10 @@ class Guide:
             targets={int(k.removeprefix("target.")): v for k, v in tensors.items() if k.startswith("target.")},
             target_steps={int(index): int(step) for index, step in meta["target_steps"].items()},
         )
+
+
+def depth_in(gaussians: Gaussians, camera: Cameras, backend: Backend) -> Float[Tensor, "H W"]:
+    """Expected z of the Gaussians, 0 where there is nothing."""
+    frame = backend.forward(gaussians, camera, coverage.PLAIN, depth=True)
+    assert frame.depths is not None
+    return expected_depth(frame.depths, frame.alphas)

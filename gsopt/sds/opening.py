@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from gsopt.guidance_config import GuidanceConfig
+from gsopt.sds.choice import EMBEDDED
 from gsopt.sds.prior import Prior
 
 
@@ -12,6 +15,11 @@ def open_prior(name: str, config: GuidanceConfig) -> Prior:
     Raises InputError for one that is missing or broken, UsageError for settings it cannot have, MissingDependency
     without diffusers.
     """
+    from gsopt.sds.view_prior import ViewPrior, is_view_prior
+
+    own = EMBEDDED if name == "embedded" else Path(name).expanduser()
+    if is_view_prior(own):
+        return ViewPrior(own, config)
     from gsopt.sds.diffusers_prior import DiffusersPrior
     from gsopt.sds.folder import find_folder
 

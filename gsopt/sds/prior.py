@@ -1,7 +1,7 @@
 """What a diffusion prior is to the rest of gsopt: `denoise(x_t, t, conditions) -> x0_hat`.
 
 Two kinds stand behind it. Stable Diffusion works on latents, takes text and image tokens and predicts eps or v; the
-embedded prior works on pixels, takes the current render, posed reference views and tokens, and predicts x0. Each reads
+view-conditioned prior works on pixels, takes the current render and posed reference views, and predicts x0. Each reads
 from a `Condition` what it knows and ignores the rest. Policies, classifier-free guidance and training see x0 only.
 """
 
@@ -32,7 +32,9 @@ class References:
     alphas: Float[Tensor, "K 1 S S"]
     """1 where the view has no alpha."""
     cameras: Cameras
-    """K of them, S x S px. World frame: the prior expresses their rays in the frame of the camera it denoises for."""
+    """K of them, S x S px."""
+    depths: Float[Tensor, "K S S"] | None = None
+    """Expected z of the current Gaussians in these views, for priors that want references aligned."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,10 @@ class Condition:
     """SD 2.1-unCLIP's image embedding with its noise level."""
     render: Float[Tensor, "4 S S"] | None = None
     """The render to be improved, color on the background and alpha, aligned with the image pixel by pixel."""
+    depth: Float[Tensor, "S S"] | None = None
+    """Expected z of the render, 0 where there is nothing."""
+    uncertainty: Float[Tensor, "S S"] | None = None
+    """How free the input views left each pixel of the render, 0 to 1."""
     camera: Cameras | None = None
     """The camera of the image, S x S px."""
     references: References | None = None
@@ -89,8 +95,8 @@ class Prior(Protocol):
     """Largest |x0| there is (1 for pixels in [-1, 1]); None for latents."""
     class_embedding_width: int | None
     """E of `Condition.class_embedding` (half of what unCLIP's network takes); None where it takes none."""
-    pixel_exact: bool
-    """Whether encode and decode are exact inverses and cost nothing."""
+    aligned: bool
+    """Whether it looks at the render, its depth and the references; else these are not made for it."""
 
     def encode(self, images: Images) -> Latents:
         """Into the model's space, float32. Differentiable."""

@@ -155,7 +155,8 @@ def nearest(references: References, camera: Cameras, count: int) -> References |
     rows = torch.sort(cosine, descending=True, stable=True).indices[:count]
     cameras = references.cameras
     chosen = replace(cameras, viewmats=cameras.viewmats[rows], Ks=cameras.Ks[rows])
-    return References(references.images[rows], references.alphas[rows], chosen)
+    depths = None if references.depths is None else references.depths[rows]
+    return References(references.images[rows], references.alphas[rows], chosen, depths)
 
 
 def _level(direction: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:

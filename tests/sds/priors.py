@@ -31,7 +31,7 @@ class PixelPrior:
     name: str = "toy"
     x0_limit: float | None = None
     class_embedding_width: int | None = None
-    pixel_exact: bool = True
+    aligned: bool = True
     schedule: NoiseSchedule = field(default_factory=cosine_schedule)
     calls: list[int] = field(default_factory=list)
     """Rows of every call."""

@@ -19,7 +19,7 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.sds import policies
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.guidance import MOST_FAILURES, Guide
+from gsopt.sds.guidance import MOST_FAILURES, Guide, Seen
 
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)
@@ -88,7 +88,8 @@ def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
 
     z = z_of(gaussians.sh0)
     assert sample.x0 is not None
-    _, look = guided._look(7, sample.view, camera, (z.float() + 1) / 2, torch.zeros(SIZE, SIZE), z.float())
+    seen = Seen(camera, (z.float() + 1) / 2, torch.zeros(SIZE, SIZE), sample.uncertainty)
+    _, look = guided._look(7, sample.view, seen, z.float())
     g = policies.sds(guided.prior, z.float(), look).g.double()
     direction, h = torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(1)), 1e-3
     ahead, behind = (

@@ -1,0 +1,181 @@
+"""`gsopt finetune` in order: fits, training, measurement, the prior's folder. Each part continues where it was."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsopt import check
+from gsopt.data.files import is_regular
+from gsopt.data.scene import is_posed
+from gsopt.errors import InputError, UsageError
+from gsopt.events import to_json, write_atomic
+from gsopt.finetune.course import Course
+from gsopt.finetune.fits import Pairs, make_pairs
+from gsopt.finetune.folder import write_folder
+from gsopt.finetune.learn import STATE, Training
+from gsopt.finetune.measure import measure, sheet
+from gsopt.guidance_config import GuidanceConfig
+from gsopt.raster.api import make_backend
+from gsopt.raster.backend import Backend
+from gsopt.sds.choice import EMBEDDED
+from gsopt.sds.view_prior import ViewPrior, is_view_prior, make_unet
+
+SHEET_EVERY = 500
+"""Steps between two sample sheets."""
+NEWS = 0.02
+"""Share of a new loss in the running mean that is shown."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Which scenes are learned from, and how often each is reconstructed."""
+
+    train: tuple[Path, ...]
+    val: tuple[Path, ...]
+    """Held out: only measured on."""
+    fits: int = 3
+    size: int = 128
+    """Side of the renders, px."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check.at_least("--fits", self.fits, 1, "3 is usual.")
+        check.within("--size", self.size, 64, 512, "The default is 128.")
+
+
+def find_scenes(roots: Sequence[Path], val: Sequence[str]) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Posed scenes among and below `roots`, by name; those called `val` apart (none given: every tenth)."""
+    found = {p.name: p for root in roots for p in (root, *sorted(root.iterdir() if root.is_dir() else ())) if _is(p)}
+    unknown = [name for name in val if name not in found]
+    if unknown:
+        raise UsageError(f"`--val` names {unknown[0]!r}, which is none of the {len(found)} scenes found. Correct it.")
+    names = sorted(found)
+    held = list(val) or names[9::10]
+    train = tuple(found[name] for name in names if name not in held)
+    if not train:
+        raise InputError(
+            f"No posed scene to learn from in {', '.join(map(str, roots))}. Give folders with transforms.json or "
+            "COLMAP models, or a folder of such folders (scripts/synth_views.py makes them)."
+        )
+    return train, tuple(found[name] for name in held)
+
+
+def _is(path: Path) -> bool:
+    return path.is_dir() and is_posed(path)
+
+
+def start(lessons: Lessons, course: Course, out: Path, base: str | None, threads: int, say: Say) -> dict[str, Any]:
+    """`finetune` on this machine's compiled backend; `base` as on the command line."""
+    if threads:
+        torch.set_num_threads(threads)
+    folder = None if base is None else EMBEDDED if base == "embedded" else Path(base)
+    return finetune(lessons, course, out, make_backend("auto", threads), folder, say)
+
+
+def finetune(
+    lessons: Lessons, course: Course, out: Path, backend: Backend, base: Path | None, say: Say
+) -> dict[str, Any]:
+    """Train a prior into `out` and return what was measured on the held-out scenes.
+
+    Run again after a kill it goes on where it was. Raises InputError for scenes that cannot be read and for an `out`
+    that holds something else.
+    """
+    _claim(out, lessons, course, base)
+    train = collect(lessons.train, lessons, out / "pairs", backend, say)
+    val = collect(lessons.val, lessons, out / "pairs", backend, say) if lessons.val else None
+    say(f"{len(train)} renders of {len(lessons.train)} scenes to learn from, {len(val) if val else 0} held out")
+    training = Training(make_unet(course.seed) if base is None else _base(base), course)
+    if (out / STATE).exists():
+        training.restore(out / STATE)
+        say(f"continuing at step {training.step}")
+    training.run(train, out, _Log(out, course, training, val, say))
+    unet = training.averaged()
+    measured = measure(unet, val) if val else {}
+    write_folder(out, unet, lessons, course, base, measured)
+    return measured
+
+
+def collect(scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Backend, say: Say) -> Pairs:
+    """All pairs of the scenes; what is not in `folder` is made. A scene that cannot be fitted is named and left out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = []
+    for scene in scenes:
+        for fit in range(lessons.fits):
+            path = folder / f"{scene.name}_{fit}.safetensors"
+            if not is_regular(path):
+                try:
+                    make_pairs(scene, lessons.size, fit, lessons.seed, backend).save(path)
+                except InputError as error:
+                    say(f"{scene.name} is left out: {error}")
+                    break
+                say(f"fitted {scene.name}, {fit + 1} of {lessons.fits}")
+            parts.append(Pairs.load(path))
+    if not parts:
+        raise InputError(f"None of the {len(scenes)} scenes could be reconstructed. See the messages above.")
+    return Pairs.cat(parts)
+
+
+def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> None:
+    """Remember what `out` is made from; InputError where it is something else."""
+    path = out / "finetune.json"
+    plan = {
+        "course": asdict(course),
+        "fits": lessons.fits,
+        "size": lessons.size,
+        "seed": lessons.seed,
+        "train": [scene.name for scene in lessons.train],
+        "val": [scene.name for scene in lessons.val],
+        "base": None if base is None else base.name,
+    }
+    if path.exists():
+        if json.loads(path.read_text("utf-8")) != plan:
+            raise InputError(f"{out} belongs to a training with other scenes or flags. Repeat them or give another -o.")
+        return
+    if out.exists() and any(entry.name != "pairs" for entry in out.iterdir()):
+        raise InputError(f"{out} is not empty and holds no training of a prior. Give another -o.")
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, to_json(plan))
+
+
+def _base(folder: Path) -> Any:
+    if not is_view_prior(folder):
+        raise InputError(f"`--base` {folder} is no view-conditioned prior. Give a folder that `gsopt finetune` wrote.")
+    return ViewPrior(folder, GuidanceConfig()).unet.requires_grad_(True)
+
+
+class _Log:
+    """Hears every step: a line now and then, train.jsonl, and sample sheets of held-out renders."""
+
+    def __init__(self, out: Path, course: Course, training: Training, val: Pairs | None, say: Say) -> None:
+        self._out, self._course, self._training, self._val, self._say = out, course, training, val, say
+        self._mean: float | None = None
+        self._began, self._first = time.monotonic(), training.step
+
+    def __call__(self, step: int, found: float) -> None:
+        self._mean = found if self._mean is None else self._mean + NEWS * (found - self._mean)
+        if step % 100 == 0 or step == self._course.steps:
+            seconds = time.monotonic() - self._began
+            left = seconds / max(1, step - self._first) * (self._course.steps - step)
+            self._say(f"step {step}/{self._course.steps}  loss {self._mean:.5f}  ETA {left / 60:.0f} min")
+            with (self._out / "train.jsonl").open("a", encoding="utf-8") as log:
+                log.write(json.dumps({"step": step, "loss": self._mean, "seconds": round(seconds, 1)}) + "\n")
+        if self._val is not None and step % SHEET_EVERY == 0:
+            self._show(step)
+
+    def _show(self, step: int) -> None:
+        unet = self._training.averaged()
+        folder = self._out / "samples"
+        folder.mkdir(exist_ok=True)
+        assert self._val is not None
+        with torch.no_grad():
+            sheet(unet, self._val).save(folder / f"step_{step:06d}.png")
+        self._training.back()
