@@ -216,6 +216,13 @@ class ScheduleConfig:
     (training/schedule.py); the flag without a step means full resolution throughout."""
     stop_when_flat: bool = False
     """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
+    crop_masked: bool = False
+    """Draw only where a masked image shows something, the whole image every 8th step (training/window.py)."""
+    rest_converged: bool = False
+    """After the last refinement, leave out every other visit of a view whose loss no longer falls."""
+    bands: Literal["steps", "residual"] = "steps"
+    """Draw one more band of the spherical harmonics every `sh_degree_every` steps, or only then and where the residual
+    depends on the view (training/skipping.py)."""
 
     def __post_init__(self) -> None:
         given = self.coarse_until or ()
@@ -225,6 +232,7 @@ class ScheduleConfig:
                 f"`--schedule.coarse-until` must be rising steps above 0, got {list(given)}. Try 500 1500."
             )
         check.within("number of --schedule.coarse-until", len(given), 0, 6, "Each one halves the image.")
+        check.one_of("--schedule.bands", self.bands, ("steps", "residual"))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, UInt8
@@ -12,6 +12,7 @@ from torch import Tensor
 from gsopt.cameras import Cameras
 from gsopt.data.resample import area_downscale, downscaled_size, premultiply
 from gsopt.data.scene import View
+from gsopt.training.window import content_window
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -25,6 +26,13 @@ class Target:
     """On the background of the step."""
     alphas: Float[Tensor, "H W"] | None
     """None where the image has no alpha and no mask."""
+    size: tuple[int, int]
+    """Height and width of the whole image, px, of which this may be a window."""
+
+    @property
+    def share(self) -> float:
+        """Of the whole image's pixels."""
+        return self.colors.shape[0] * self.colors.shape[1] / (self.size[0] * self.size[1])
 
 
 def content_pixels(views: Sequence[View], most: int = 16) -> float:
@@ -50,32 +58,44 @@ class Targets:
         self._fixed = fixed
         self._budget = budget
         self._factor = 1
-        self._kept: dict[int, Target] = {}
+        self._kept: dict[tuple[int, bool], Target] = {}
         self._bytes = 0
 
-    def get(self, index: int, factor: int, background: Float[Tensor, "3"]) -> Target:
-        """View `index` with width and height divided by `factor`. The tensors belong to the cache: do not write."""
+    def get(self, index: int, factor: int, background: Float[Tensor, "3"], *, whole: bool = True) -> Target:
+        """View `index` with width and height divided by `factor`; not `whole`: the window where its alpha shows
+        something. The tensors belong to the cache: do not write."""
         if factor != self._factor:
             self._kept.clear()
             self._factor, self._bytes = factor, 0
-        target = self._kept.get(index) or self._make(index)
+        target = self._kept.get((index, whole)) or self._make(index, whole)
         if self._fixed is not None or target.alphas is None:
             return target
         colors = torch.addcmul(target.colors, 1 - target.alphas[..., None], background)
-        return Target(target.camera, colors, target.alphas)
+        return replace(target, colors=colors)
 
-    def _make(self, index: int) -> Target:
+    def _make(self, index: int, whole: bool) -> Target:
         view = self._views[index]
         height, width = (downscaled_size(extent, self._factor) for extent in (view.camera.height, view.camera.width))
         colors, alphas = premultiplied(view.pixels(), width, height)
         if self._fixed is not None and alphas is not None:
             colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed)
-        target = Target(view.camera.to(torch.float32).resized(width, height), colors, alphas)
-        size = colors.nbytes + (0 if alphas is None else alphas.nbytes)
+        target = Target(view.camera.to(torch.float32).resized(width, height), colors, alphas, (height, width))
+        if not whole:
+            target = cropped(target)
+        size = target.colors.nbytes + (0 if target.alphas is None else target.alphas.nbytes)
         if self._bytes + size <= self._budget:
-            self._kept[index] = target
+            self._kept[index, whole] = target
             self._bytes += size
         return target
+
+
+def cropped(target: Target) -> Target:
+    """The part of a whole target where its alpha shows something; all of it where there is no alpha."""
+    window = content_window(target.alphas)
+    if window is None or target.alphas is None:
+        return target
+    colors, alphas = window.crop(target.colors), window.crop(target.alphas)
+    return replace(target, camera=window.camera(target.camera), colors=colors, alphas=alphas)
 
 
 def premultiplied(

@@ -23,7 +23,9 @@ from gsopt.training.morton import morton_order
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 from gsopt.training.order import ViewOrder, generators
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
+from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import BACKGROUNDS, Target, Targets, content_pixels
+from gsopt.training.window import draws_whole
 
 if TYPE_CHECKING:
     from gsopt.training.guidance import RunGuidance
@@ -78,6 +80,8 @@ class Trainer:
         self._generators = generators(config.seed)
         self._order = ViewOrder(views, self._generators["views"])
         self._flatness = schedule.Flatness.of(views)
+        self._resting = Resting(views)
+        self._bands = Bands(config.optimizer.sh_degree_every, self._max_sh_degree)
         fixed = BACKGROUNDS.get(config.data.background)
         self._background = None if fixed is None else torch.tensor(fixed)
         self._targets = Targets(scene.train, self._background, int(TARGET_SHARE * config.data.cache_mb * 1e6))
@@ -100,23 +104,43 @@ class Trainer:
         """Take one step; returns its photometric loss and the name of its view."""
         self.step += 1
         index = self._order.next()
+        if self._rests(index):
+            return self._passed(index)
         background = self._background if self._background is not None else self._random_background()
-        target = self._targets.get(index, schedule.downscale(self.step, self._coarse_until), background)
+        factor = schedule.downscale(self.step, self._coarse_until)
+        whole = not self.config.schedule.crop_masked or draws_whole(self.step)
+        target = self._targets.get(index, factor, background, whole=whole)
         settings = self.settings()
         loss, gradients = self._gradients(target, background, settings)
         if self._guidance is not None:
             self._guidance.add(self.step, self.model.gaussians, settings, gradients)
         self._update(gradients, settings.sh_degree)
         self._change_set()
+        self._resting.note(index, loss)
+        self.finished_early = self._is_flat(loss)
+        return loss, self.scene.train[index].name
+
+    def _rests(self, index: int) -> bool:
+        """Whether this step's view has converged and is left out; only once the set of Gaussians is settled, and never
+        with guidance, which counts the steps it is asked for."""
+        config = self.config
+        settled = max(schedule.refine_stop(config.density, config.iterations), *self._coarse_until, 0)
+        wanted = config.schedule.rest_converged and self._guidance is None
+        return wanted and self.step > settled and self._resting.skips(index)
+
+    def _passed(self, index: int) -> tuple[float, str]:
+        """A step that computes nothing: its view's last loss, and its name."""
+        loss = float(self._resting.last[index])
+        self._change_set()
         self.finished_early = self._is_flat(loss)
         return loss, self.scene.train[index].name
 
     def settings(self) -> RasterSettings:
         """How the current step draws."""
-        return RasterSettings(
-            sh_degree=schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree),
-            antialiased=self.config.antialiased,
-        )
+        degree = schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree)
+        if self.config.schedule.bands == "residual":
+            degree = self._bands.degree
+        return RasterSettings(sh_degree=degree, antialiased=self.config.antialiased)
 
     def _random_background(self) -> Float[Tensor, "3"]:
         return torch.rand(3, generator=self._generators["background"])
@@ -131,14 +155,16 @@ class Trainer:
         photometric = self.backend.photometric(frame.colors, target.colors, self.config.loss.lambda_dssim)
         v_alphas = None
         if self._weights.alpha > 0 and target.alphas is not None:
-            v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha)
-        gradients = self.backend.backward(
-            frame, photometric.v_colors, v_alphas, absgrad=self._wants_absgrad(), into=self._spent
-        )
+            v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha * target.share)
+        v_colors = photometric.v_colors if target.share == 1 else photometric.v_colors.mul_(target.share)
+        gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=self._wants_absgrad(), into=self._spent)
         self._spent = gradients
-        self._density.after_backward(self.step, gradients, frame.radii, target.camera.width, target.camera.height)
-        self._show(photometric.loss, frame.colors, target.colors)
-        return photometric.loss, self._regularized(gradients, dropout)
+        self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])
+        if self.config.schedule.bands == "residual" and self._bands.watches(self.step):
+            self._bands.note(self.model.gaussians, target.camera, gradients)
+        loss = photometric.loss * target.share
+        self._show(loss, frame.colors, target)
+        return loss, self._regularized(gradients, dropout)
 
     def _wants_absgrad(self) -> bool:
         """Whether adc will read absolute gradients of this step."""
@@ -171,7 +197,9 @@ class Trainer:
         self._density.after_step(self.model, lr_means)
 
     def _change_set(self) -> None:
-        """Add, remove and reorder Gaussians where this step asks for it."""
+        """Add, remove and reorder Gaussians where this step asks for it, and take the next band when it is due."""
+        if self.config.schedule.bands == "residual":
+            self._bands.decide(self.step)
         refined = self._density.refine(self.step, self.model)
         moved = refined is not self.model
         self.model = refined
@@ -182,6 +210,7 @@ class Trainer:
             moved = True
         if moved:
             self._select(morton_order(self.model.gaussians.means))
+            self._bands.forget()
             if self._guidance is not None:
                 self._guidance.forget()
 
@@ -189,11 +218,11 @@ class Trainer:
         self.model = self.model.select(rows)
         self._density.select(rows)
 
-    def _show(self, loss: float, rendered: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> None:
+    def _show(self, loss: float, rendered: Float[Tensor, "H W 3"], target: Target) -> None:
         shown = self.shown
         shown.loss = loss if shown.loss is None else (1 - NEWS) * shown.loss + NEWS * loss
         if self.step % PSNR_EVERY == 1:
-            mse = float(torch.nn.functional.mse_loss(rendered, target))
+            mse = target.share * float(torch.nn.functional.mse_loss(rendered, target.colors))
             shown.mse = mse if shown.mse is None else (1 - NEWS) * shown.mse + NEWS * mse
 
     def _is_flat(self, loss: float) -> bool:
@@ -231,6 +260,8 @@ class Trainer:
         tensors |= {f"density.{name}": tensor for name, tensor in self._density.tensors().items()}
         tensors |= {f"rng.{name}": generator.get_state() for name, generator in self._generators.items()}
         tensors["epoch.order"] = self._order.order
+        tensors |= {f"resting.{name}": tensor for name, tensor in self._resting.tensors().items()}
+        tensors |= {f"bands.{name}": tensor for name, tensor in self._bands.tensors().items()}
         meta = {
             "step": self.step,
             "adam_steps": self.model.steps,
@@ -250,6 +281,8 @@ class Trainer:
         _require_same_shapes(gaussians.validate(), exp_avg, exp_avg_sq)
         self.model = Model(gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS})
         self._density.restore(_part(tensors, "density."))
+        self._resting.restore(_part(tensors, "resting."))
+        self._bands.restore(_part(tensors, "bands."))
         if self._guidance is not None:
             self._guidance.restore(_part(tensors, "guidance."), meta["guidance"])
         for name, generator in self._generators.items():

@@ -13,7 +13,7 @@ import pytest
 import torch
 from tiny_scenes import tiny_config
 
-from gsopt.config import DataConfig, DensityConfig, ScheduleConfig, SparseConfig, TrainConfig
+from gsopt.config import DataConfig, DensityConfig, OptimizerConfig, ScheduleConfig, SparseConfig, TrainConfig
 from gsopt.errors import UsageError
 from gsopt.events import read_events
 from gsopt.training import loop
@@ -45,10 +45,17 @@ def configs(dataset: Path) -> dict[str, TrainConfig]:
         "random background": replace(base, data=DataConfig(path=str(dataset), background="random")),
         "reference backend": replace(base, backend="reference"),
         "coarse to fine": replace(base, schedule=ScheduleConfig(coarse_until=(12,), stop_when_flat=True)),
+        "skipping": replace(
+            base,
+            schedule=ScheduleConfig(coarse_until=(4,), crop_masked=True, rest_converged=True, bands="residual"),
+            density=DensityConfig(refine_start=4, refine_every=5, refine_stop=10, max_gaussians=90),
+            optimizer=OptimizerConfig(sh_degree_every=9),
+            sparse=SparseConfig(below_views=0),
+        ),
     }
 
 
-NAMES = ("adc", "mcmc", "few views", "random background", "reference backend", "coarse to fine")
+NAMES = ("adc", "mcmc", "few views", "random background", "reference backend", "coarse to fine", "skipping")
 
 
 @pytest.fixture(scope="module")
