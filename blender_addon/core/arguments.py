@@ -1,0 +1,158 @@
+"""From what stands in the panel to argument lists: no shell, no quoting, every value its own word."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+PHOTOS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif", ".bmp")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+
+@dataclass(frozen=True)
+class Training:
+    """What `gsopt train` is asked for."""
+
+    iterations: int = 7000
+    downscale: int = 1
+    """Width and height are divided by this."""
+    max_gaussians: int = 0
+    """0: as many as the images call for."""
+    views: int = 0
+    """Learn from this many, well spread; 0: all."""
+    hold_out: bool = False
+    strategy: str = "adc"
+    background: str = "white"
+    seed: int = 0
+    threads: int = 0
+    backend: str = "auto"
+
+
+PRESETS = {
+    "DRAFT": Training(iterations=1000, downscale=2),
+    "STANDARD": Training(iterations=7000),
+    "FINE": Training(iterations=30_000),
+}
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """What guides a run where the photos leave the scene open."""
+
+    prior: str = "auto"
+    """auto (gsopt decides), off, embedded, sd21, or a folder or hub id."""
+    weight: float = 0.2
+    prompts: Path | None = None
+    references: tuple[Path, ...] = ()
+    device: str = "auto"
+    front_view: int = -1
+    """Input view that shows the front; -1: not said."""
+
+
+def train(python: Path, data: Path, run: Path, training: Training, guidance: Guidance) -> list[str]:
+    """`gsopt train` with a live preview about twenty times."""
+    words = [str(python), "-m", "gsopt", "train", str(data), "-m", str(run)]
+    words += ["--iterations", str(training.iterations), "--seed", str(training.seed)]
+    words += ["--preview-every", str(max(25, min(500, training.iterations // 20)))]
+    words += ["--strategy", training.strategy, "--background", training.background]
+    words += ["--threads", str(training.threads), "--backend", training.backend]
+    words += ["--resolution", str(training.downscale)] if training.downscale > 1 else []
+    words += ["--max-gaussians", str(training.max_gaussians)] if training.max_gaussians else []
+    words += ["--views", str(training.views)] if training.views else []
+    words += ["--eval"] if training.hold_out else []
+    return words + guide(guidance)
+
+
+def guide(guidance: Guidance) -> list[str]:
+    if guidance.prior == "off":
+        return ["--lambda-sds", "0"]
+    words = [] if guidance.prior == "auto" else ["--prior", guidance.prior, "--lambda-sds", f"{guidance.weight:g}"]
+    words += ["--prompts", str(guidance.prompts)] if guidance.prompts else []
+    for path in guidance.references:
+        words += ["--ref-image", str(path)]
+    words += ["--guidance.front-view", str(guidance.front_view)] if guidance.front_view >= 0 else []
+    return words + (["--guidance.device", guidance.device] if guidance.device != "auto" else [])
+
+
+def resume(python: Path, run: Path, threads: int = 0) -> list[str]:
+    """Go on from the newest checkpoint, with the settings the run was started with."""
+    return [str(python), "-m", "gsopt", "train", "--resume", "-m", str(run), "--threads", str(threads)]
+
+
+def poses(python: Path, photos: Path, out: Path, seed: int = 0, threads: int = 0) -> list[str]:
+    """`gsopt sfm` for a folder of photos or a video."""
+    words = [str(python), "-m", "gsopt", "sfm", str(photos), "-o", str(out)]
+    return [*words, "--seed", str(seed), "--threads", str(threads)]
+
+
+@dataclass(frozen=True)
+class Writing:
+    """What `gsopt prompts` is asked for."""
+
+    notes: str
+    domain: str = "generic"
+    count: int = 8
+    llm: str = "none"
+    """Address of an OpenAI-compatible server; none: templates."""
+    model: str = ""
+    images: tuple[Path, ...] = ()
+
+
+def prompts(python: Path, writing: Writing, out: Path) -> list[str]:
+    """`gsopt prompts`: proposals from an expert's notes."""
+    words = [str(python), "-m", "gsopt", "prompts", f"--notes={writing.notes}", "--domain", writing.domain]
+    words += ["-n", str(writing.count), "--llm", writing.llm or "none", "-o", str(out)]
+    words += [f"--model={writing.model}"] if writing.model else []
+    return words + (["--images", *map(str, writing.images)] if writing.images else [])
+
+
+def doctor(python: Path) -> list[str]:
+    return [str(python), "-m", "gsopt", "doctor", "--json"]
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What scripts/synth_views.py is asked for."""
+
+    views: int = 50
+    test_views: int = 10
+    resolution: int = 256
+    layout: str = "hemisphere"
+    samples: int = 32
+    lighting: str = "studio"
+    seed: int = 0
+    threads: int = 0
+    masks: bool = False
+
+    @property
+    def total(self) -> int:
+        """Pictures."""
+        return self.views + self.test_views
+
+
+def render(blender: str, python: Path | str, script: Path, mesh: Path, out: Path, rendering: Rendering) -> list[str]:
+    """synth_views.py inside Blender in the background, or with a Python that has the module bpy when there is none."""
+    inside = [blender, "--background", "--factory-startup", "--python", str(script), "--"]
+    words = [*(inside if blender else [str(python), str(script)]), str(mesh), "-o", str(out)]
+    words += ["--views", str(rendering.views), "--test-views", str(rendering.test_views)]
+    words += ["--resolution", str(rendering.resolution), "--layout", rendering.layout]
+    words += ["--samples", str(rendering.samples), "--lighting", rendering.lighting]
+    words += ["--seed", str(rendering.seed), "--threads", str(rendering.threads), "--points", "10000"]
+    return words + (["--masks"] if rendering.masks else [])
+
+
+def with_preset(training: Training, preset: str) -> Training:
+    """The settings of a preset in place of those given; unknown presets change nothing."""
+    chosen = PRESETS.get(preset)
+    return training if chosen is None else replace(training, iterations=chosen.iterations, downscale=chosen.downscale)
+
+
+def needs_poses(source: Path) -> bool:
+    """Whether a source is a video or a folder of photos that no file gives poses for."""
+    if source.is_file():
+        return source.suffix.lower() in VIDEOS
+    posed = ("transforms_train.json", "transforms.json", "sparse", "colmap/sparse")
+    if not source.is_dir() or any((source / name).exists() for name in posed):
+        return False
+    folders = [folder for folder in (source, source / "images") if folder.is_dir()]
+    return any(file.suffix.lower() in PHOTOS for folder in folders for file in folder.iterdir())

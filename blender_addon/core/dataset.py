@@ -1,0 +1,69 @@
+"""How far synth_views.py is, by the pictures it has written, and where its object lies in the scene it came from."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .files import read_json
+
+PARTIAL = ".partial-"
+RECORD = "object.json"
+
+
+def pictures(out: Path) -> int:
+    """Pictures written so far, in finished objects and in those being made."""
+    return sum(count_png(folder / "images") for folder in objects(out))
+
+
+def count_png(folder: Path) -> int:
+    try:
+        return sum(entry.name.endswith(".png") for entry in os.scandir(folder))
+    except OSError:
+        return 0
+
+
+def objects(out: Path) -> list[Path]:
+    try:
+        return [Path(entry.path) for entry in os.scandir(out) if entry.is_dir()]
+    except OSError:
+        return []
+
+
+def finished(out: Path) -> Path | None:
+    """The dataset of the one object that was rendered, once it is there."""
+    found = [folder for folder in objects(out) if not folder.name.startswith(".") and (folder / RECORD).is_file()]
+    return found[0] if found else None
+
+
+def failure(out: Path) -> str:
+    """Why an object could not be rendered; empty where nothing is told."""
+    try:
+        with open(out / "failures.json", "rb") as file:
+            lost = json.loads(file.read(1 << 20))
+        return str(lost[0]["reason"])[:500] if lost else ""
+    except (OSError, ValueError, LookupError, TypeError):
+        return ""
+
+
+def scene_from_dataset(data: Path) -> NDArray[np.float64] | None:
+    """[4, 4] from the dataset's frame back to the scene that was rendered; None where the dataset does not say."""
+    if not (data / RECORD).is_file():
+        return None
+    matrix: Any = read_json(data / RECORD).get("normalized_from_mesh")
+    try:
+        forward = np.array(matrix, np.float64)
+        if forward.shape != (4, 4) or not all(math.isfinite(value) for value in forward.flat):
+            raise ValueError("it is no 4x4 matrix")
+        return np.linalg.inv(forward)
+    except (ValueError, TypeError, np.linalg.LinAlgError) as error:
+        raise InputError(
+            f"`normalized_from_mesh` of {data / RECORD} cannot be used: {error}. Render it again."
+        ) from error

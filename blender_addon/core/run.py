@@ -1,0 +1,230 @@
+"""Follow a run by its directory alone (docs/protocol.md of gsopt): bounded reads, never a wait.
+
+Whoever polls gets what is known so far. Half a line waits for its rest, lines that are no events are skipped, a higher
+protocol version is refused, and a reader that is far behind skips ahead.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from . import job as jobs
+from .errors import InputError
+
+PROTOCOL = 1
+PIECE = 1 << 18
+"""Bytes read at a time: a few milliseconds of work."""
+FAR_BEHIND = 1 << 21
+"""From here on the reader skips ahead to the last piece."""
+FINAL = ("done", "stopped", "error")
+MOST_MESSAGES = 50
+LONGEST = 500
+
+
+@dataclass
+class Run:
+    """What is known about a run."""
+
+    path: Path
+    status: str = "waiting"
+    """waiting, running, done, stopped, error, killed or unreadable."""
+    step: int = 0
+    total: int = 0
+    count: int = 0
+    """Gaussians."""
+    loss: float | None = None
+    psnr: float | None = None
+    eta: float | None = None
+    """Seconds."""
+    speed: float | None = None
+    """Steps per second."""
+    preview: str = ""
+    """The newest file to show, absolute; empty where there is none."""
+    pid: int = 0
+    began: float = 0.0
+    """Time of the last `started`, seconds since 1970."""
+    messages: list[str] = field(default_factory=list)
+    """Warnings and errors, the newest last."""
+    history: list[tuple[int, float]] = field(default_factory=list)
+    """(step, PSNR), thinned."""
+
+    @property
+    def share(self) -> float:
+        """How far it is, 0 to 1."""
+        return min(1.0, self.step / self.total) if self.total > 0 else 0.0
+
+    @property
+    def problem(self) -> str:
+        """The last thing that went wrong, if the run is over because of it."""
+        return self.messages[-1] if self.messages and self.status in ("error", "killed", "unreadable") else ""
+
+    def say(self, message: object) -> None:
+        text = " ".join(str(message).split())[:LONGEST]
+        if not self.messages or self.messages[-1] != text:
+            self.messages = [*self.messages[1 - MOST_MESSAGES :], text]
+
+
+class Follower:
+    """Reads a run's events as they come."""
+
+    def __init__(self, path: Path, job: jobs.Job | None = None) -> None:
+        self.run = Run(path)
+        self.job = job
+        self._offset = 0
+        self._broken = False
+
+    def poll(self) -> Run:
+        """Read at most one piece, look whether the process lives, and tell what is known."""
+        if self.run.status != "unreadable":
+            try:
+                behind = self._read()
+            except InputError as error:
+                self.run.status = "unreadable"
+                self.run.say(error)
+                return self.run
+            if not behind and self.run.status in ("waiting", "running"):
+                self._check_process()
+        return self.run
+
+    def _read(self) -> bool:
+        """Take in one piece; whether there is more."""
+        path = self.run.path / "events.jsonl"
+        try:
+            with open(path, "rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                if size < self._offset:
+                    self._offset = 0  # another file under the same name
+                if size - self._offset > FAR_BEHIND:
+                    self._offset, self._broken = size - PIECE, True
+                file.seek(self._offset)
+                data = file.read(PIECE)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise InputError(f"Cannot read {path}: {error.strerror}. Check the folder.") from error
+        end = data.rfind(b"\n") + 1
+        if not end and len(data) == PIECE:
+            self._offset, self._broken = self._offset + PIECE, True  # no event is that long: skip to its end
+            return True
+        lines = data[:end].split(b"\n")
+        for event in events_in(lines[1:] if self._broken else lines, path):
+            self._take(event)
+        self._broken = self._broken and not end
+        self._offset += end
+        return self._offset < size and end > 0 and len(data) == PIECE
+
+    def _take(self, event: dict[str, Any]) -> None:
+        run, kind = self.run, event.get("kind")
+        if kind == "started":
+            run.status, run.pid = "running", whole(event.get("pid"))
+            run.began = number(event.get("time")) or 0.0
+        if kind == "progress":
+            run.status = "running"
+            run.loss, run.psnr = number(event.get("loss")), number(event.get("psnr"))
+            run.eta, run.speed = number(event.get("eta_seconds")), number(event.get("steps_per_second"))
+        if kind in ("started", "progress", "done", "stopped"):
+            run.step = whole(event.get("step"), run.step)
+            run.total = whole(event.get("total"), run.total)
+            run.count = whole(event.get("n"), run.count)
+        if kind == "progress" and run.psnr is not None:
+            run.history = thinned([*run.history, (run.step, run.psnr)])
+        if kind == "preview":
+            run.preview = inside(run.path, event.get("path")) or run.preview
+        if kind in ("warning", "guidance", "error"):
+            run.say(event.get("message", ""))
+        if kind in FINAL:
+            run.status, run.eta = str(kind), None
+
+    def _check_process(self) -> None:
+        run = self.run
+        if self.job is not None:
+            if not jobs.alive(self.job) and not self._more():
+                run.status = "killed" if run.status == "running" else "error"
+                said = jobs.complaint(self.job) if run.status == "error" else "It ended without a word. See the log."
+                run.say(f"{said} Continue it with Resume." if run.status == "killed" else said)
+        elif run.status == "running" and run.pid and not jobs.process_alive(run.pid, run.began):
+            run.status = "killed"
+            run.say("The run was killed. Continue it from its last checkpoint with Resume.")
+
+    def _more(self) -> bool:
+        """Whether the process wrote something between the last read and its end."""
+        try:
+            return (self.run.path / "events.jsonl").stat().st_size > self._offset and self._read_rest()
+        except OSError:
+            return False
+
+    def _read_rest(self) -> bool:
+        before = self._offset
+        self._read()
+        return self._offset > before
+
+
+def events_in(lines: list[bytes], path: Path) -> Iterator[dict[str, Any]]:
+    """The events among these lines. InputError for a protocol this reader does not know."""
+    for line in lines:
+        try:
+            event = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if not isinstance(event, dict) or not isinstance(event.get("seq"), int):
+            continue
+        version = event.get("v")
+        if version != PROTOCOL:
+            raise InputError(
+                f"{path} speaks protocol version {str(version)[:20]}, this extension knows {PROTOCOL}. "
+                "Install the extension that came with that gsopt."
+            )
+        yield event
+
+
+def whole(value: Any, otherwise: int = 0) -> int:
+    """A whole number that Blender's properties can hold."""
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31 else otherwise
+
+
+def number(value: Any) -> float | None:
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+
+
+def inside(run: Path, name: Any) -> str:
+    """An announced file of the run, absolute; empty when it is none or points out of the directory."""
+    if not isinstance(name, str) or not name:
+        return ""
+    path = (run / name).resolve()
+    return str(path) if path.is_relative_to(run.resolve()) else ""
+
+
+def thinned(history: list[tuple[int, float]]) -> list[tuple[int, float]]:
+    return history if len(history) <= 400 else history[::2]
+
+
+def ask_to_stop(run: Path) -> None:
+    """The run finishes its step, saves and exits. InputError where the request cannot be written."""
+    try:
+        (run / "stop").touch()
+    except OSError as error:
+        raise InputError(f"Cannot write {run / 'stop'}: {error.strerror}. End its process instead.") from error
+
+
+def splats_of(run: Path) -> Path | None:
+    """The file to import: the result, else the newest preview, else nothing."""
+    result = run / "splat.ply"
+    if result.is_file():
+        return result
+    previews = sorted(p for p in (run / "previews").glob("step_*.ply") if not p.name.startswith("."))
+    return previews[-1] if previews else None
+
+
+def earlier_runs(parent: Path, most: int = 100) -> list[Path]:
+    """Run directories in a folder, the newest first."""
+    try:
+        found = [(entry.stat().st_mtime, Path(entry.path)) for entry in os.scandir(parent) if entry.is_dir()]
+    except OSError:
+        return []
+    newest = sorted(found, reverse=True)[: 4 * most]
+    return [path for _, path in newest if (path / "config.json").is_file() or (path / "events.jsonl").is_file()][:most]

@@ -1,0 +1,111 @@
+"""What the Inspect panel says about splats, and which of them its filters keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .splats import Splats
+
+BINS = 10
+FAR = 6.0
+"""An outlier lies farther from the median position than this many times the median distance."""
+LARGE = 20.0
+"""An outlier is larger than this many times the median size."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One bin of a histogram."""
+
+    low: float
+    high: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What can be said about splats at a glance."""
+
+    count: int
+    sh_degree: int
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    median_size: float
+    opacities: tuple[Bar, ...]
+    sizes: tuple[Bar, ...]
+    """Geometric mean of the three scales, bins equal in the logarithm."""
+    outliers: int
+
+
+def sizes(splats: Splats) -> NDArray[np.float32]:
+    """[N] geometric mean of the three scales."""
+    return np.cbrt(splats.scales.prod(axis=1, dtype=np.float64)).astype(np.float32)
+
+
+def outliers(splats: Splats) -> NDArray[np.bool_]:
+    """[N] far from the rest, or far larger."""
+    if not len(splats):
+        return np.zeros(0, bool)
+    distance = np.linalg.norm(splats.positions - np.median(splats.positions, axis=0), axis=1)
+    largest = splats.scales.max(axis=1)
+    far = distance > FAR * max(float(np.median(distance)), 1e-12)
+    return far | (largest > LARGE * max(float(np.median(largest)), 1e-12))
+
+
+def summary(splats: Splats) -> Summary:
+    """Counts, extent and histograms; zeros where there are no splats."""
+    if not len(splats):
+        return Summary(0, splats.sh_degree, (0, 0, 0), (0, 0, 0), 0.0, (), (), 0)
+    size = np.maximum(sizes(splats), 1e-30)
+    low, high = np.quantile(np.log10(size), (0.001, 0.999))
+    edges = 10 ** np.linspace(low, max(high, low + 0.01), BINS + 1)
+    return Summary(
+        count=len(splats),
+        sh_degree=splats.sh_degree,
+        low=tuple(splats.positions.min(axis=0).tolist()),
+        high=tuple(splats.positions.max(axis=0).tolist()),
+        median_size=float(np.median(size)),
+        opacities=bars(splats.opacities, np.linspace(0, 1, BINS + 1)),
+        sizes=bars(np.clip(size, edges[0], edges[-1]), edges),
+        outliers=int(outliers(splats).sum()),
+    )
+
+
+def bars(values: Any, edges: Any) -> tuple[Bar, ...]:
+    counts, edges = np.histogram(values, edges)
+    return tuple(Bar(float(a), float(b), int(n)) for a, b, n in zip(edges, edges[1:], counts, strict=False))
+
+
+@dataclass(frozen=True)
+class Filter:
+    """What is kept; a limit that is None does not bind."""
+
+    opacity: tuple[float, float] = (0.0, 1.0)
+    largest_scale: float | None = None
+    """Scene units, of the longest axis."""
+    farthest: float | None = None
+    """From `center`, scene units."""
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    box_from_local: NDArray[np.float64] | None = None
+    """[4, 4] brings the splats' frame into that of a cube from -1 to 1."""
+    without_outliers: bool = False
+
+    def keeps(self, splats: Splats) -> NDArray[np.bool_]:
+        """[N] which splats pass."""
+        low, high = self.opacity
+        kept = (splats.opacities >= low) & (splats.opacities <= high)
+        if self.largest_scale is not None:
+            kept &= splats.scales.max(axis=1) <= self.largest_scale
+        if self.farthest is not None:
+            offset = splats.positions - np.array(self.center, np.float32)
+            kept &= np.einsum("ij,ij->i", offset, offset) <= np.float32(self.farthest) ** 2
+        if self.box_from_local is not None:
+            matrix = self.box_from_local.astype(np.float32)
+            kept &= (np.abs(splats.positions @ matrix[:3, :3].T + matrix[:3, 3]) <= 1).all(axis=1)
+        if self.without_outliers:
+            kept &= ~outliers(splats)
+        return kept

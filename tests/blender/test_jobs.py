@@ -1,0 +1,140 @@
+"""Programs that the panel starts: found, begun with a clean environment, watched, ended, and heard when they fail."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from blender_addon.core import interpreter, job
+from blender_addon.core.errors import InputError, UsageError
+
+
+def wait(running: job.Job) -> None:
+    until = time.monotonic() + 30
+    while job.alive(running):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_blenders_python_variables_do_not_reach_another_python() -> None:
+    blenders = {"PYTHONPATH": "/b", "PYTHONHOME": "/b", "BLENDER_USER_RESOURCES": "/b", "VIRTUAL_ENV": "/b"}
+    loader = {"LD_LIBRARY_PATH": "/opt/Blender/lib"}
+    ours = {"PATH": "/usr/bin", "HOME": "/home/a", "LANG": "C"}
+    clean = job.clean_environment({**blenders, **loader, **ours})
+    assert not set(clean) & {*blenders, *loader}
+    assert ours.items() <= clean.items()
+
+
+def test_arguments_arrive_as_they_are(odd_folder: Path) -> None:
+    words = ["a b", "$(touch x)", "; rm -rf .", "'", '"', "öß春", "*"]
+    script = "import json, os, sys; print(json.dumps([sys.argv[1:], os.getcwd(), sys.flags.utf8_mode]))"
+    running = job.start("doctor", [sys.executable, "-c", script, *words], odd_folder / "job")
+    wait(running)
+    heard = json.loads((odd_folder / "job" / job.OUTPUT).read_text(encoding="utf-8"))
+    assert heard == [words, str((odd_folder / "job").resolve()), 1]
+    assert job.exit_code(running) == 0
+    assert job.read_job(odd_folder / "job") == running
+
+
+def test_a_job_is_ended_with_all_it_started(tmp_path: Path) -> None:
+    script = "import subprocess, sys, time\nsubprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
+    running = job.start("train", [sys.executable, "-c", script + "print('up'); time.sleep(60)"], tmp_path)
+    until = time.monotonic() + 20
+    while job.last_words(running) != "up":
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    if hasattr(os, "getpgid"):
+        assert os.getpgid(running.pid) == running.pid, "a group of its own: Blender's end does not end it"
+    job.end(running)
+    wait(running)
+    job.end(running)
+    assert not job.alive(running)
+
+
+def test_what_was_said_last_and_why_it_failed(tmp_path: Path) -> None:
+    script = "print('gsopt: There is no dataset in /x. Give one.'); print(); raise SystemExit(3)"
+    running = job.start("train", [sys.executable, "-c", script], tmp_path)
+    wait(running)
+    assert job.complaint(running) == "gsopt: There is no dataset in /x. Give one."
+    assert job.exit_code(running) == 3
+
+
+def test_a_program_that_cannot_start_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no-such-python"):
+        job.start("train", [str(tmp_path / "no-such-python")], tmp_path / "a")
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="Choose another folder"):
+        job.start("train", [sys.executable], tmp_path / "file" / "below")
+
+
+@pytest.mark.parametrize("record", ["", "[]", "{}", '{"version": 9}', '{"version": 1, "arguments": 3}'])
+def test_a_damaged_record_is_refused(tmp_path: Path, record: str) -> None:
+    (tmp_path / job.RECORD).write_text(record)
+    with pytest.raises(InputError, match=r"job\.json"):
+        job.read_job(tmp_path)
+
+
+def make_venv(folder: Path) -> Path:
+    python = interpreter.python_of(folder / ".venv")
+    python.parent.mkdir(parents=True)
+    for path in (python, python.with_name(interpreter.console_script())):
+        path.touch(mode=0o755)
+    return python
+
+
+def test_the_interpreter_is_found_above_the_file_and_checked_when_named(tmp_path: Path) -> None:
+    python = make_venv(tmp_path / "project")
+    below = tmp_path / "project" / "scenes" / "a"
+    below.mkdir(parents=True)
+    assert interpreter.find("", [below], {}) == python
+    assert interpreter.find(str(python), [], {}) == python
+    other = make_venv(tmp_path / "other")
+    assert interpreter.find("", [below], {"GSOPT_PYTHON": str(other)}) == other
+    with pytest.raises(UsageError, match="not there"):
+        interpreter.find(str(tmp_path / "gone"), [below], {})
+    with pytest.raises(UsageError, match="Install gsopt"):
+        interpreter.find("", [tmp_path / "elsewhere"], {"PATH": ""})
+
+
+def test_the_source_folder_is_found_above_the_interpreter(tmp_path: Path) -> None:
+    python = make_venv(tmp_path)
+    with pytest.raises(UsageError, match=r"synth_views\.py"):
+        interpreter.checkout(python)
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts" / "synth_views.py").touch()
+    assert interpreter.checkout(python) == tmp_path
+    with pytest.raises(UsageError, match=r"synth_views\.py"):
+        interpreter.checkout(python, str(tmp_path / "nowhere"))
+
+
+ANSWER = {
+    "gsopt": "0.1.0",
+    "rasterizer": {"backend": "cpu", "isa": "avx2", "ms_per_step": 9.5, "problem": None},
+    "missing_extras": {"sds": "pip", "": "pip"},
+}
+
+
+def test_the_doctors_answer_is_read() -> None:
+    answer = interpreter.read_answer("a warning\n" + json.dumps(ANSWER), "python")
+    assert answer.line == "gsopt 0.1.0: avx2, 9.5 ms a step; not installed: sds"
+
+
+@pytest.mark.parametrize(
+    ("output", "said"),
+    [
+        ("/usr/bin/python3: No module named gsopt", "no working gsopt: /usr/bin/python3: No module named gsopt"),
+        ("", "said nothing"),
+        ('{"gsopt": "0.1.0"}', "no working gsopt"),
+        (json.dumps({**ANSWER, "gsopt": "7.3.1"}), "gsopt 7.3.1, this extension knows 0.1"),
+        (json.dumps({**ANSWER, "rasterizer": None}), "no working gsopt"),
+    ],
+)
+def test_a_wrong_interpreter_is_told_apart(output: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        interpreter.read_answer(output, "python")
+    assert said in str(caught.value)

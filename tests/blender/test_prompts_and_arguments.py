@@ -1,0 +1,152 @@
+"""prompts.json means the same here and in gsopt; what stands in the panel becomes flags that gsopt takes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from blender_addon.core import arguments
+from blender_addon.core.errors import InputError
+from blender_addon.core.prompts import Document, Prompt, read_prompts, write_prompts
+
+PROMPTS = (
+    Prompt("ein alter Stuhl, 春"),
+    Prompt("blurry", 0.5, "back", "negative", "llm:qwen3:4b", "seen from behind\nit is open", -0.2),
+)
+
+
+def test_what_is_written_is_read_with_all_that_stands_beside(odd_folder: Path) -> None:
+    document = Document(PROMPTS, {"notes": "oak", "made": {"source": "template", "raw": ""}, "images": []})
+    write_prompts(odd_folder / "prompts.json", document)
+    assert read_prompts(odd_folder / "prompts.json") == document
+
+
+def test_gsopt_reads_the_same_prompts(tmp_path: Path) -> None:
+    schema = pytest.importorskip("gsopt.llm_prompts.schema")
+    write_prompts(tmp_path / "a.json", Document(PROMPTS))
+    theirs = schema.read_prompts(tmp_path / "a.json")
+    found = tuple(getattr(theirs, "prompts", theirs))
+    assert [asdict(prompt) for prompt in found] == [asdict(prompt) for prompt in PROMPTS]
+
+
+@pytest.mark.parametrize(
+    "prompts",
+    [
+        [{}],
+        [{"text": ""}],
+        [{"text": "  "}],
+        [{"text": 3}],
+        [{"text": "a\x1b[2J"}],
+        [{"text": "a" * 1001}],
+        [{"text": "a", "colour": 1}],
+        [{"text": "a", "weight": "1"}],
+        [{"text": "a", "weight": -1}],
+        [{"text": "a", "weight": True}],
+        [{"text": "a", "view": "below"}],
+        [{"text": "a", "view": ["all"]}],
+        [{"text": "a", "polarity": "neutral"}],
+        [{"text": "a", "source": "llm:"}],
+        [{"text": "a", "score": 2}],
+        [{"text": "a"}] * 257,
+        "a",
+        None,
+    ],
+)
+def test_what_is_no_prompt_is_refused_as_gsopt_does(tmp_path: Path, prompts: object) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"version": 1, "prompts": prompts}))
+    with pytest.raises(InputError):
+        read_prompts(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"{", b"[" * 100_000, b"{}", b'{"version": 2, "prompts": []}'])
+def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "a.json").write_bytes(data)
+    with pytest.raises(InputError):
+        read_prompts(tmp_path / "a.json")
+    (tmp_path / "b.json").write_bytes(b" " * (2 << 20))
+    with pytest.raises(InputError, match=r"b\.json.*larger"):
+        read_prompts(tmp_path / "b.json")
+
+
+EVERYTHING = (
+    arguments.Training(50, 2, 999, 4, True, "mcmc", "black", 7, 1, "reference"),
+    arguments.Guidance("off"),
+)
+
+
+@pytest.mark.parametrize(
+    ("training", "guidance"),
+    [
+        (arguments.Training(), arguments.Guidance()),
+        (arguments.with_preset(arguments.Training(views=4), "DRAFT"), arguments.Guidance("off")),
+        EVERYTHING,
+        (arguments.Training(), arguments.Guidance("embedded", 0.3, None, (Path("a b.png"),), "cpu", 2)),
+    ],
+)
+def test_gsopt_takes_the_flags(
+    tmp_path: Path,
+    training: arguments.Training,
+    guidance: arguments.Guidance,
+) -> None:
+    tyro = pytest.importorskip("tyro")
+    from gsopt.cli.train import Flags
+
+    words = arguments.train(Path("python"), tmp_path / "a b", tmp_path / "-run", training, guidance)
+    assert words[:4] == ["python", "-m", "gsopt", "train"]
+    flags = tyro.cli(Flags, args=words[4:])
+    assert (flags.iterations, flags.resolution, flags.seed) == (training.iterations, training.downscale, training.seed)
+    assert (flags.views or 0, flags.density.max_gaussians or 0) == (training.views, training.max_gaussians)
+    assert (flags.density.strategy, flags.background) == (training.strategy, training.background)
+    assert (flags.threads, flags.backend, flags.eval) == (training.threads, training.backend, training.hold_out)
+    assert (str(flags.data), str(flags.run)) == (str(tmp_path / "a b"), str(tmp_path / "-run"))
+    weight = {"off": 0.0, "auto": None}.get(guidance.prior, guidance.weight)
+    assert flags.guidance.lambda_sds == weight
+    assert flags.guidance.ref_image == tuple(map(str, guidance.references))
+
+
+def test_gsopt_sfm_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pycolmap")
+    from gsopt.cli import sfm
+    from gsopt.data.sfm import pipeline
+
+    class Asked(Exception):
+        pass
+
+    def heard(photos: Path, out: Path, config: object, say: object) -> None:
+        raise Asked(photos, out, config.seed, config.threads)  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(pipeline, "pose_photos", heard)
+    words = arguments.poses(Path("python"), tmp_path, tmp_path / "a posed", 3, 1)
+    with pytest.raises(Asked) as asked:
+        sfm.main(words[4:])
+    assert asked.value.args == (tmp_path, tmp_path / "a posed", 3, 1)
+
+
+def test_synth_views_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    from conftest import ROOT
+
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    import synth_views
+
+    rendering = arguments.Rendering(views=3, test_views=1, resolution=32, masks=True)
+    words = arguments.render("blender", "", Path("s.py"), tmp_path / "a.glb", tmp_path / "out", rendering)
+    items, settings, how = synth_views.parse(synth_views.own_arguments(words))
+    assert ([str(item.mesh) for item in items], how["out"]) == ([str(tmp_path / "a.glb")], tmp_path / "out")
+    assert (settings.views, settings.test_views, settings.resolution, settings.masks) == (3, 1, (32, 32), True)
+    plain = arguments.render("", "python", Path("s.py"), tmp_path / "a.glb", tmp_path / "out", rendering)
+    assert synth_views.own_arguments(plain[1:]) == synth_views.own_arguments(words)
+
+
+def test_photos_need_poses_and_datasets_do_not(tmp_path: Path) -> None:
+    assert not arguments.needs_poses(tmp_path)
+    (tmp_path / "a.JPG").touch()
+    assert arguments.needs_poses(tmp_path)
+    assert arguments.needs_poses(tmp_path / "a.JPG") is False
+    (tmp_path / "film.mp4").touch()
+    assert arguments.needs_poses(tmp_path / "film.mp4")
+    (tmp_path / "transforms.json").touch()
+    assert not arguments.needs_poses(tmp_path)

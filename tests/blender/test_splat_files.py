@@ -1,0 +1,177 @@
+"""Splat files: what is written is read, gsopt reads the same, and a file that lies is refused by name."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_splats import random_splats
+
+from blender_addon.core.errors import InputError
+from blender_addon.core.ply import read_ply, write_ply
+from blender_addon.core.splats import Splats
+from blender_addon.core.spz import read_spz
+
+
+def assert_alike(a: Splats, b: Splats, tolerance: float) -> None:
+    for field in fields(Splats):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        assert left.shape == right.shape
+        assert np.allclose(left, right, rtol=tolerance, atol=tolerance), field.name
+
+
+@pytest.mark.parametrize("bands", [0, 3, 8, 15])
+@pytest.mark.parametrize("count", [0, 1, 300])
+def test_what_is_written_is_read(odd_folder: Path, bands: int, count: int) -> None:
+    splats = random_splats(count, bands)
+    write_ply(odd_folder / "a.ply", splats, comment="SplatRenderMode: default")
+    assert_alike(read_ply(odd_folder / "a.ply"), splats, 1e-5)
+
+
+def test_a_second_round_changes_no_position_color_or_byte_of_sh(odd_folder: Path, some_splats: Splats) -> None:
+    write_ply(odd_folder / "a.ply", some_splats)
+    again = read_ply(odd_folder / "a.ply")
+    for name in ("positions", "base", "sh"):
+        assert np.array_equal(getattr(again, name), getattr(some_splats, name))
+
+
+def test_opacities_of_0_and_1_stay_finite(odd_folder: Path, some_splats: Splats) -> None:
+    some_splats.opacities[:2] = 0, 1
+    some_splats.scales[0] = 0
+    write_ply(odd_folder / "a.ply", some_splats)
+    again = read_ply(odd_folder / "a.ply")
+    assert again.opacities[0] < 1e-6
+    assert again.opacities[1] > 1 - 1e-6
+    assert again.scales[0].max() < 1e-37
+
+
+def test_columns_in_any_order_and_type_are_found(tmp_path: Path, some_splats: Splats) -> None:
+    write_ply(tmp_path / "a.ply", some_splats)
+    head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property")]
+    rows = np.frombuffer(data, np.dtype([(name, "<f4") for name in names]))
+    other = np.empty(len(rows), np.dtype([("red", "u1"), *((name, ">f8") for name in reversed(names))]))
+    for name in names:
+        other[name] = rows[name]
+    lines = ["ply", "format binary_big_endian 1.0", f"element vertex {len(rows)}", "property uchar red"]
+    lines += [f"property double {name}" for name in reversed(names)]
+    (tmp_path / "b.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + other.tobytes())
+    assert_alike(read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "a.ply"), 0)
+
+
+def ply_with(tmp_path: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
+    write_ply(tmp_path / "good.ply", random_splats(20, 0))
+    data = (tmp_path / "good.ply").read_bytes()
+    assert old in data
+    lying = data.replace(old, new, 1)
+    (tmp_path / "bad.ply").write_bytes(lying[: len(lying) - cut])
+    return tmp_path / "bad.ply"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "cut", "said"),
+    [
+        (b"vertex 20", b"vertex 900000000", 0, "claims 900,000,000 rows"),
+        (b"vertex 20", b"vertex -3", 0, "makes no sense"),
+        (b"", b"", 100, "cut short"),
+        (b"binary_little_endian", b"ascii", 0, "not a binary PLY"),
+        (b"ply\n", b"obj\n", 0, "no PLY file"),
+        (b"end_header", b"end_of_it_", 0, "no PLY file"),
+        (b"float opacity", b"float clarity", 0, "lacks opacity"),
+        (b"float nx", b"float f_rest_0", 0, "f_rest_*"),
+        (b"float nx", b"list uchar int nx", 0, "makes no sense"),
+        (b"float nx", b"float x", 0, "makes no sense"),
+        (b"element vertex", b"element face", 0, "no element `vertex`"),
+    ],
+)
+def test_a_ply_that_lies_is_refused(tmp_path: Path, old: bytes, new: bytes, cut: int, said: str) -> None:
+    with pytest.raises(InputError, match=r"bad\.ply") as caught:
+        read_ply(ply_with(tmp_path, old, new, cut))
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("positions", np.nan), ("scales", np.inf), ("rotations", 0.0)])
+def test_a_value_that_is_none_is_named_with_its_row(
+    tmp_path: Path, some_splats: Splats, name: str, value: float
+) -> None:
+    getattr(some_splats, name)[7] = value
+    with np.errstate(invalid="ignore"):
+        write_ply(tmp_path / "a.ply", some_splats)
+    with pytest.raises(InputError, match="splat 7"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_failed_write_keeps_the_old_file(
+    tmp_path: Path, some_splats: Splats, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "a.ply"
+    target.write_bytes(b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_ply(target, some_splats)
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_gsopt_reads_what_the_extension_writes_and_the_other_way_round(tmp_path: Path, some_splats: Splats) -> None:
+    torch = pytest.importorskip("torch")
+    import gsopt
+    from gsopt.formats.ply import save_ply
+
+    write_ply(tmp_path / "a.ply", some_splats)
+    theirs = gsopt.load_splats(tmp_path / "a.ply")
+    assert np.allclose(theirs.opacities.numpy(), some_splats.opacities, atol=1e-6)
+    assert np.allclose(theirs.log_scales.exp().numpy(), some_splats.scales, rtol=1e-5)
+    assert torch.equal(theirs.shN, torch.from_numpy(some_splats.sh))
+    save_ply(tmp_path / "b.ply", theirs)
+    assert_alike(read_ply(tmp_path / "b.ply"), some_splats, 1e-5)
+
+
+@pytest.mark.parametrize("bands", [0, 15])
+def test_spz_means_the_same_as_to_gsopt(tmp_path: Path, bands: int) -> None:
+    pytest.importorskip("torch")
+    import gsopt
+    from gsopt.formats.ply import save_ply
+    from gsopt.formats.spz import save_spz
+
+    write_ply(tmp_path / "a.ply", random_splats(300, bands))
+    save_spz(tmp_path / "a.spz", gsopt.load_splats(tmp_path / "a.ply"))
+    save_ply(tmp_path / "b.ply", gsopt.load_splats(tmp_path / "a.spz"))
+    ours, theirs = read_spz(tmp_path / "a.spz"), read_ply(tmp_path / "b.ply")
+    same_side = np.sign((ours.rotations * theirs.rotations).sum(axis=1, keepdims=True))
+    ours.rotations[:] *= same_side
+    assert_alike(ours, theirs, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "ends before"),
+        (b"NGSP" + bytes(20), "version 4"),
+        (b"no gzip at all", "damaged"),
+        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000_000, 3, 12, 0, 0)), "claims"),
+        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10, 3, 12, 0, 0) + bytes(50)), "ends before"),
+        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10, 9, 12, 0, 0)), "SH degree 9"),
+        (gzip.compress(struct.pack("<4sIIBBBB", b"GNSP", 3, 10, 0, 12, 0, 0)), "no .spz"),
+        (gzip.compress(bytes(1 << 20))[:200], "no .spz"),
+    ],
+)
+def test_an_spz_that_lies_is_refused(tmp_path: Path, data: bytes, said: str) -> None:
+    (tmp_path / "bad.spz").write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        read_spz(tmp_path / "bad.spz")
+    assert said in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    for read in (read_ply, read_spz):
+        with pytest.raises(InputError, match=r"gone"):
+            read(tmp_path / "gone")

@@ -1,0 +1,134 @@
+"""Views of datasets, where a rendered object lies, and the sums and filters over splats."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_splats import random_splats
+
+from blender_addon.core import dataset
+from blender_addon.core.cameras import GL_FROM_CV, read_views
+from blender_addon.core.errors import InputError
+from blender_addon.core.statistics import Filter, summary
+
+POSE = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+
+
+def frames(*names: str) -> list[dict[str, object]]:
+    return [{"file_path": name, "transform_matrix": POSE.tolist()} for name in names]
+
+
+def test_nerf_synthetic_views_have_pictures_without_suffix(odd_folder: Path) -> None:
+    (odd_folder / "train").mkdir()
+    (odd_folder / "train" / "r_0.png").touch()
+    for split in ("train", "test"):
+        document = {"camera_angle_x": 0.7, "frames": frames(f"./{split}/r_0")}
+        (odd_folder / f"transforms_{split}.json").write_text(json.dumps(document))
+    train, test = read_views(odd_folder)
+    assert (train.image, train.split, test.split) == (odd_folder / "train" / "r_0.png", "train", "test")
+    assert train.angle_x == 0.7
+    assert np.array_equal(train.world_from_cam, POSE)
+    assert train.shift == (0, 0)
+
+
+def test_a_principal_point_becomes_a_shift(tmp_path: Path) -> None:
+    lens = {"fl_x": 100.0, "w": 200, "h": 100, "cx": 90.0, "cy": 55.0}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames("a.png")}))
+    (view,) = read_views(tmp_path)
+    assert view.angle_x == pytest.approx(math.pi / 2)
+    assert view.shift == pytest.approx((0.05, 0.025))
+
+
+def test_colmap_poses_are_inverted_and_turned(tmp_path: Path) -> None:
+    sparse = tmp_path / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    lens = struct.pack("<iiQQ4d", 1, 1, 200, 100, 100.0, 101.0, 90.0, 55.0)
+    (sparse / "cameras.bin").write_bytes(struct.pack("<Q", 1) + lens)
+    half = math.sqrt(0.5)
+    head = struct.pack("<i7di", 1, half, 0, 0, half, 0.5, -1.0, 2.0, 1)
+    images = struct.pack("<Q", 1) + head + b"a b.jpg\0" + struct.pack("<Q", 2) + bytes(48)
+    (sparse / "images.bin").write_bytes(images)
+    (view,) = read_views(tmp_path)
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    world_from_cv = np.eye(4)
+    world_from_cv[:3, :3], world_from_cv[:3, 3] = turn.T, -turn.T @ [0.5, -1.0, 2.0]
+    assert np.allclose(view.world_from_cam, world_from_cv @ GL_FROM_CV)
+    assert (view.name, view.width, view.shift) == ("a b", 200, pytest.approx((0.05, 0.025)))
+    for cut in range(0, len(images), 7):
+        (sparse / "images.bin").write_bytes(images[:cut])
+        with pytest.raises(InputError, match="COLMAP"):
+            read_views(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {},
+        {"frames": 3},
+        {"frames": [3]},
+        {"frames": frames("a")},
+        {"camera_angle_x": 0.7, "frames": [{"file_path": "a"}]},
+        {"camera_angle_x": 9.0, "frames": frames("a")},
+        {"camera_angle_x": "x", "frames": frames("a")},
+        {"camera_angle_x": 0.7, "frames": [{"file_path": "a", "transform_matrix": [[math.nan] * 4] * 4}]},
+    ],
+)
+def test_views_that_cannot_be_used_are_refused_by_name(tmp_path: Path, document: object) -> None:
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"transforms\.json"):
+        read_views(tmp_path)
+
+
+def test_pictures_are_counted_while_they_are_made(tmp_path: Path) -> None:
+    assert dataset.pictures(tmp_path / "gone") == 0
+    images = tmp_path / ".partial-1-ball" / "images"
+    images.mkdir(parents=True)
+    for name in ("a.png", "b.png", "c.tmp"):
+        (images / name).touch()
+    assert dataset.pictures(tmp_path) == 2
+    assert dataset.finished(tmp_path) is None
+    (tmp_path / "ball").mkdir()
+    forward = np.diag([2.0, 2.0, 2.0, 1.0])
+    forward[:3, 3] = 1, 2, 3
+    (tmp_path / "ball" / dataset.RECORD).write_text(json.dumps({"normalized_from_mesh": forward.tolist()}))
+    assert dataset.finished(tmp_path) == tmp_path / "ball"
+    back = dataset.scene_from_dataset(tmp_path / "ball")
+    assert back is not None
+    assert np.allclose(back @ forward, np.eye(4))
+    assert dataset.scene_from_dataset(tmp_path) is None
+
+
+def test_histograms_count_every_splat_and_outliers_are_found() -> None:
+    splats = random_splats(1000)
+    splats.positions[3] = 1e4
+    splats.scales[4] = 50
+    found = summary(splats)
+    assert sum(bar.count for bar in found.opacities) == sum(bar.count for bar in found.sizes) == found.count == 1000
+    assert found.outliers == 2
+    assert summary(splats.rows(slice(0, 0))).count == 0
+
+
+def test_each_filter_keeps_what_it_says() -> None:
+    splats = random_splats(1000)
+    assert Filter().keeps(splats).all()
+    assert np.array_equal(Filter(opacity=(0.5, 1)).keeps(splats), splats.opacities >= 0.5)
+    assert np.array_equal(Filter(largest_scale=0.05).keeps(splats), splats.scales.max(axis=1) <= np.float32(0.05))
+    distance = np.linalg.norm(splats.positions - (1, 0, 0), axis=1)
+    assert np.array_equal(Filter(farthest=1.0, center=(1, 0, 0)).keeps(splats), distance <= 1)
+    box = np.linalg.inv(np.array([[0.5, 0, 0, 1], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+    inside = (np.abs(splats.positions - (1, 0, 0)) <= (0.5, 2, 1)).all(axis=1)
+    assert np.array_equal(Filter(box_from_local=box).keeps(splats), inside)
+    both = Filter(opacity=(0.5, 1), farthest=1.0).keeps(splats)
+    assert np.array_equal(both, (splats.opacities >= 0.5) & (np.linalg.norm(splats.positions, axis=1) <= 1))
+
+
+def test_at_most_never_shows_more_and_keeps_small_sets() -> None:
+    splats = random_splats(1000)
+    for most in (1, 7, 333, 999, 1000, 5000):
+        assert 1 <= len(splats.at_most(most)) <= most
+    assert splats.at_most(1000) is splats
