@@ -15,6 +15,7 @@ import torch
 from gsopt.config import TrainConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
+from gsopt.events import to_json, write_atomic
 from gsopt.formats import save_splats
 from gsopt.gaussians import Gaussians
 from gsopt.init import first_gaussians
@@ -206,6 +207,8 @@ def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
     _save(trainer, directory, clock)
     save_splats(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.config.antialiased)
+    if trainer.poses is not None:
+        write_atomic(directory.path / "poses.json", to_json(trainer.poses.record(trainer.scene.origin)))
 
 
 def _save(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:

@@ -22,6 +22,7 @@ from gsopt.training.floaters import solitary
 from gsopt.training.morton import morton_order
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 from gsopt.training.order import ViewOrder, generators
+from gsopt.training.poses import PoseRefinement
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import BACKGROUNDS, Target, Targets, content_pixels
@@ -74,6 +75,7 @@ class Trainer:
         self.finished_early = False
         self._spent: Gradients | None = None  # the last step's gradients: their memory serves again
         self._guidance = guidance
+        self.poses = PoseRefinement(config.poses, scene, config.iterations) if config.poses.refine else None
         self._sparse = schedule.is_sparse(config, views)
         self._weights = schedule.weights(config, views)
         self._max_sh_degree = schedule.max_sh_degree(config, views)
@@ -111,7 +113,11 @@ class Trainer:
         whole = not self.config.schedule.crop_masked or draws_whole(self.step)
         target = self._targets.get(index, factor, background, whole=whole)
         settings = self.settings()
+        if self.poses is not None:
+            target = replace(target, camera=self.poses.camera(index, target.camera))
         loss, gradients = self._gradients(target, background, settings)
+        if self.poses is not None:
+            self.poses.update(index, self.step, self.model.gaussians, gradients, settings.sh_degree)
         if self._guidance is not None:
             self._guidance.add(self.step, self.model.gaussians, settings, gradients)
         self._update(gradients, settings.sh_degree)
@@ -273,6 +279,8 @@ class Trainer:
         if self._guidance is not None:
             guiding, meta["guidance"] = self._guidance.state()
             tensors |= {f"guidance.{name}": tensor for name, tensor in guiding.items()}
+        if self.poses is not None:
+            tensors |= {f"poses.{name}": tensor for name, tensor in self.poses.tensors().items()}
         return tensors, meta
 
     def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -285,6 +293,8 @@ class Trainer:
         self._bands.restore(_part(tensors, "bands."))
         if self._guidance is not None:
             self._guidance.restore(_part(tensors, "guidance."), meta["guidance"])
+        if self.poses is not None:
+            self.poses.restore(_part(tensors, "poses."))
         for name, generator in self._generators.items():
             generator.set_state(tensors[f"rng.{name}"])
         self._order.restore(tensors["epoch.order"], int(meta["epoch_position"]))

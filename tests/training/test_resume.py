@@ -13,7 +13,15 @@ import pytest
 import torch
 from tiny_scenes import tiny_config
 
-from gsopt.config import DataConfig, DensityConfig, OptimizerConfig, ScheduleConfig, SparseConfig, TrainConfig
+from gsopt.config import (
+    DataConfig,
+    DensityConfig,
+    OptimizerConfig,
+    PoseConfig,
+    ScheduleConfig,
+    SparseConfig,
+    TrainConfig,
+)
 from gsopt.errors import UsageError
 from gsopt.events import read_events
 from gsopt.training import loop
@@ -44,6 +52,9 @@ def configs(dataset: Path) -> dict[str, TrainConfig]:
         "few views": replace(base, sparse=SparseConfig(floater_every=7)),
         "random background": replace(base, data=DataConfig(path=str(dataset), background="random")),
         "reference backend": replace(base, backend="reference"),
+        "refined poses": replace(
+            base, poses=PoseConfig(refine=True, start=3, lr=3e-3), sparse=SparseConfig(below_views=0)
+        ),
         "coarse to fine": replace(base, schedule=ScheduleConfig(coarse_until=(12,), stop_when_flat=True)),
         "skipping": replace(
             base,
@@ -55,7 +66,16 @@ def configs(dataset: Path) -> dict[str, TrainConfig]:
     }
 
 
-NAMES = ("adc", "mcmc", "few views", "random background", "reference backend", "coarse to fine", "skipping")
+NAMES = (
+    "adc",
+    "mcmc",
+    "few views",
+    "random background",
+    "reference backend",
+    "coarse to fine",
+    "skipping",
+    "refined poses",
+)
 
 
 @pytest.fixture(scope="module")
