@@ -1,0 +1,170 @@
+"""From scenes to a prior that guides a run: what the folder is, what it refuses, and that training resumes to the bit."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsopt.cli import main
+from gsopt.errors import InputError
+from gsopt.finetune import fits
+from gsopt.finetune.course import Course
+from gsopt.finetune.fits import Pairs, make_pairs
+from gsopt.finetune.learn import STATE, Training
+from gsopt.guidance_config import GuidanceConfig
+from gsopt.raster.api import make_backend
+from gsopt.sds.opening import open_prior
+from gsopt.sds.prior import Condition
+from gsopt.sds.view_prior import CHANNELS, ViewPrior, make_unet, predict
+
+pytest.importorskip("diffusers")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
+from tiny_scenes import write_dataset
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_fits() -> None:
+    """Three fits of a handful of steps: how long they are is not what is tested."""
+    fits.LENGTHS = (12,)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("scenes")
+    for name in ("one", "two", "three"):
+        write_dataset(root / name, train=6, test=2)
+    return root
+
+
+@pytest.fixture(scope="module")
+def pairs(scenes: Path) -> Pairs:
+    return make_pairs(scenes / "one", SIZE, 0, 0, make_backend("cpu", 1))
+
+
+@pytest.fixture(scope="module")
+def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("priors") / "mine"
+    assert main([*command(scenes, out)]) == 0
+    return out
+
+
+def command(scenes: Path, out: Path, *more: str) -> list[str]:
+    flags = ["--val", "three", "--fits", "1", "--size", str(SIZE), "--steps", "2", "--batch", "2", "--threads", "1"]
+    return ["finetune", str(scenes), "-o", str(out), *flags, *more]
+
+
+def test_an_untrained_network_gives_the_render_back() -> None:
+    planes = torch.rand(2, CHANNELS - 3, SIZE, SIZE) * 2 - 1
+    x0 = predict(make_unet(0), torch.randn(2, 3, SIZE, SIZE), torch.tensor([3, 700]), planes)
+    assert torch.equal(x0, planes[:, :3])
+
+
+def test_pairs_are_made_of_views_that_were_held_out(pairs: Pairs) -> None:
+    """The input view is met well after a fit, the same bits come again, and every byte is within its alpha."""
+    assert pairs.truth.shape[1:] == (4, SIZE, SIZE)
+    assert bool((pairs.truth[:, :3] <= pairs.truth[:, 3:] + 1).all())
+    assert int(pairs.warped[:, :, 4].max()) > 100
+    assert int(pairs.uncertainty.max()) > 0
+
+
+def test_pairs_survive_their_file(pairs: Pairs, tmp_path: Path) -> None:
+    pairs.save(tmp_path / "p.safetensors")
+    for a, b in zip(vars(pairs).values(), vars(Pairs.load(tmp_path / "p.safetensors")).values(), strict=True):
+        assert torch.equal(a, b)
+    (tmp_path / "p.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0{broken}")
+    with pytest.raises(InputError, match=r"p\.safetensors"):
+        Pairs.load(tmp_path / "p.safetensors")
+
+
+def test_training_learns_and_resumes_to_the_bit(pairs: Pairs, tmp_path: Path) -> None:
+    course = Course(steps=12, batch=2, lr=2e-3)
+    whole = Training(make_unet(0), course)
+    losses = [whole.advance(pairs) for _ in range(12)]
+    first = Training(make_unet(0), course)
+    for _ in range(5):
+        first.advance(pairs)
+    first.save(tmp_path / STATE)
+    second = Training(make_unet(1), course)
+    second.restore(tmp_path / STATE)
+    assert [second.advance(pairs) for _ in range(7)] == losses[5:]
+    for name, value in whole.average.items():
+        assert torch.equal(value, second.average[name])
+    with pytest.raises(InputError, match="Cannot continue"):
+        Training(make_unet(0), Course(steps=13, batch=2)).restore(tmp_path / STATE)
+
+
+def test_training_lowers_the_loss(pairs: Pairs) -> None:
+    """Of one and the same lesson, after thirty steps on the pairs it comes from."""
+    training = Training(make_unet(0), Course(steps=30, batch=4, lr=1e-3))
+    training.advance(pairs)
+    losses = [training.advance(pairs) for _ in range(29)]
+    assert sum(losses[-8:]) < 0.8 * sum(losses[:8])
+
+
+def test_the_folder_is_a_prior(prior: Path) -> None:
+    """diffusers reads its network, gsopt opens it by its path, and its card names the scenes and what was measured."""
+    import diffusers
+
+    stock = diffusers.UNet2DConditionModel.from_pretrained(prior / "unet")
+    assert stock.config.out_channels == 48
+    opened = open_prior(str(prior), GuidanceConfig())
+    assert isinstance(opened, ViewPrior)
+    assert opened.size == SIZE
+    x0 = opened.denoise(torch.zeros(1, 3, SIZE, SIZE), torch.tensor([300]), [Condition()])
+    assert x0.shape == (1, 3, SIZE, SIZE)
+    card = (prior / "README.md").read_text()
+    assert "| one |" in card
+    assert "| two |" in card
+    assert "| three |" not in card
+    assert set(json.loads((prior / "gsopt_prior.json").read_text())["measured"]["repair"]) >= {"300", "500"}
+
+
+def test_a_prior_of_ones_own_guides_a_run(prior: Path, scenes: Path, tmp_path: Path) -> None:
+    flags = ["--iterations", "20", "--prior", str(prior), "--guidance.guard-views", "0", "--guidance.every", "2"]
+    flags += ["--guidance.min-uncertainty", "0", "--init-count", "60", "--backend", "cpu", "--threads", "1"]
+    assert main(["train", str(scenes / "three"), "-m", str(tmp_path / "run"), *flags]) == 0
+    summary = json.loads((tmp_path / "run" / "guidance" / "summary.json").read_text())
+    assert summary["guided"] > 3
+    assert summary["failed"] == 0
+
+
+def test_the_same_command_goes_on_and_another_is_refused(prior: Path, scenes: Path) -> None:
+    before = (prior / "README.md").read_bytes()
+    assert main(command(scenes, prior)) == 0
+    assert (prior / "README.md").read_bytes() == before
+    assert main(command(scenes, prior, "--lr", "1e-3")) == 3
+    assert (prior / "README.md").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        ("not json", "gsopt_prior.json"),
+        ('{"size": 100}', "size 100"),
+        ('{"size": "64"}', "size '64'"),
+        ("[]", "gsopt_prior.json"),
+    ],
+)
+def test_a_broken_card_is_named(broken: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "gsopt_prior.json").write_text(broken)
+    with pytest.raises(InputError, match=said):
+        open_prior(str(tmp_path), GuidanceConfig())
+
+
+def test_missing_weights_are_named(tmp_path: Path) -> None:
+    (tmp_path / "gsopt_prior.json").write_text('{"size": 64}')
+    with pytest.raises(InputError, match="unet"):
+        _ = open_prior(str(tmp_path), GuidanceConfig()).unet  # type: ignore[attr-defined]
+
+
+def test_data_without_scenes_and_unknown_val_names_are_refused(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["finetune", str(tmp_path / "empty"), "-o", str(tmp_path / "out")]) == 3
+    assert main([*command(scenes, tmp_path / "out")[:4], "--val", "four"]) == 2
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,78 @@
+"""What a prior learns from: laws that every batch keeps, whatever was cut, turned, recolored and left out."""
+
+from __future__ import annotations
+
+import torch
+
+from gsopt.finetune.fits import Pairs
+from gsopt.finetune.lessons import REPAIR_SHARE, SIDE, draw, on_background
+from gsopt.sds.view_prior import CHANNELS, WARPED, cosine_schedule
+
+NOISE = cosine_schedule()
+
+
+def random_bytes(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+
+
+def perfect_pairs(count: int = 3, size: int = 80) -> Pairs:
+    """Renders that equal the truth, and references that do."""
+    truth = random_bytes(count, 4, size, size)
+    truth[:, :3] = torch.minimum(truth[:, :3], truth[:, 3:])  # premultiplied
+    full = torch.full((count, WARPED, 1, size, size), 255, dtype=torch.uint8)
+    warped = torch.cat([truth[:, None].expand(-1, WARPED, -1, -1, -1), full], 2)
+    return Pairs(truth, truth.clone(), random_bytes(count, size, size, seed=1), warped)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_cuts_turns_and_colors_are_the_same_in_all_images_of_a_row() -> None:
+    """Where the render and the references are the truth they still are after every change that was made."""
+    for seed in range(4):
+        batch = draw(perfect_pairs(), 16, NOISE, generator(seed))
+        assert batch.planes.shape == (16, CHANNELS, SIDE, SIDE) or batch.planes.shape[1] == CHANNELS - 3
+        known = batch.planes[:, 3].flatten(1).any(1)
+        assert int(known.sum()) > 10
+        torch.testing.assert_close(batch.planes[known, :3], batch.x0[known])
+        for k in range(WARPED):
+            colors, confidence = batch.planes[:, 5 + 4 * k : 8 + 4 * k], batch.planes[:, 8 + 4 * k]
+            there = confidence.flatten(1).any(1)
+            assert 4 < int(there.sum()) <= 16
+            torch.testing.assert_close(colors[there], batch.x0[there])
+
+
+def test_repair_lessons_never_see_the_truth() -> None:
+    """A white truth and a black render: what is left of x_t without its noise is one of the two, in the stated mix."""
+    pairs = perfect_pairs()
+    pairs.truth.fill_(255)
+    pairs.render.zero_()
+    pairs.render[:, 3] = 255
+    seen = 0
+    for seed in range(8):
+        batch = draw(pairs, 32, NOISE, generator(seed))
+        signal = NOISE.signal(batch.t, batch.x_t)
+        mean = (batch.x_t.mean((1, 2, 3)) / signal.sqrt().flatten())[signal.flatten() > 0.2]
+        truth = batch.x0.mean((1, 2, 3))[signal.flatten() > 0.2]
+        repair = mean < -0.9
+        assert bool((repair | ((mean - truth).abs() < 0.1)).all())
+        seen += int(repair.sum())
+    assert 0.6 < seen / (8 * 32 * REPAIR_SHARE) < 1.3
+
+
+def test_backgrounds_are_the_same_in_all_images_of_a_row() -> None:
+    pairs = perfect_pairs()
+    background = torch.rand(3, 3, generator=generator(0))
+    images = on_background(pairs, background)
+    torch.testing.assert_close(images.truth, images.render[:, :3])
+    torch.testing.assert_close(images.truth, images.warped[:, 1, :3])
+    hole = pairs.truth[:, 3] == 0
+    assert bool(hole.any())
+    torch.testing.assert_close(images.truth.permute(0, 2, 3, 1)[hole], background[hole.nonzero()[:, 0]])
+
+
+def test_the_same_generator_draws_the_same_batch() -> None:
+    first, second = (draw(perfect_pairs(), 4, NOISE, generator(3)) for _ in range(2))
+    for a, b in zip(vars(first).values(), vars(second).values(), strict=True):
+        assert torch.equal(a, b)
