@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar
 from gsopt import check
 from gsopt.errors import InputError, UsageError
 from gsopt.guidance_config import GuidanceConfig
+from gsopt.presets import PRESETS, Preset
 
 T = TypeVar("T")
 
@@ -236,25 +237,6 @@ class ScheduleConfig:
 
 
 @dataclass(frozen=True)
-class PoseConfig:
-    """Correct the poses of the input views while learning."""
-
-    refine: bool = False
-    """Learn a small rigid motion for every input view; held-out views stay where they are."""
-    lr: float = 1e-3
-    """How far a step shifts the picture of the view it draws, radians, at first."""
-    lr_final: float = 1e-5
-    """The same at the last step; log-linear in between."""
-    start: int = 500
-    """Poses stay as given for this many steps: there must be something to align with."""
-
-    def __post_init__(self) -> None:
-        check.within("--poses.lr", self.lr, 1e-9, 0.1, "The default is 0.001.")
-        check.within("--poses.lr-final", self.lr_final, 1e-9, 0.1, "The default is 0.00001.")
-        check.at_least("--poses.start", self.start, 0, "The default is 500.")
-
-
-@dataclass(frozen=True)
 class TrainConfig:
     """One run, complete: with the data and the same version of gsopt it gives the same bits again."""
 
@@ -266,7 +248,8 @@ class TrainConfig:
     sparse: SparseConfig = field(default_factory=SparseConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
-    poses: PoseConfig = field(default_factory=PoseConfig)
+    preset: Preset = "default"
+    """Where the settings came from that no flag named (gsopt/presets.py)."""
     iterations: int = 7000
     seed: int = 0
     backend: Literal["auto", "cpu", "reference"] = "auto"
@@ -280,6 +263,7 @@ class TrainConfig:
     """Steps between two preview PLYs; 0 = none."""
 
     def __post_init__(self) -> None:
+        check.one_of("--preset", self.preset, tuple(PRESETS))
         check.at_least("--iterations", self.iterations, 1, "Drop the flag for the default of 7000.")
         check.at_least("--threads", self.threads, 0, "0 takes one thread per core.")
         check.within("--seed", self.seed, 0, 2**31 - 1, "Give a whole number in that range.")
