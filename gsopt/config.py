@@ -237,6 +237,25 @@ class ScheduleConfig:
 
 
 @dataclass(frozen=True)
+class PoseConfig:
+    """Correct the poses of the input views while learning."""
+
+    refine: bool = False
+    """Learn a small rigid motion for every input view; held-out views stay where they are."""
+    lr: float = 1e-3
+    """How far a step shifts the picture of the view it draws, radians, at first."""
+    lr_final: float = 1e-5
+    """The same at the last step; log-linear in between."""
+    start: int = 500
+    """Poses stay as given for this many steps: there must be something to align with."""
+
+    def __post_init__(self) -> None:
+        check.within("--poses.lr", self.lr, 1e-9, 0.1, "The default is 0.001.")
+        check.within("--poses.lr-final", self.lr_final, 1e-9, 0.1, "The default is 0.00001.")
+        check.at_least("--poses.start", self.start, 0, "The default is 500.")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """One run, complete: with the data and the same version of gsopt it gives the same bits again."""
 
@@ -248,6 +267,7 @@ class TrainConfig:
     sparse: SparseConfig = field(default_factory=SparseConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    poses: PoseConfig = field(default_factory=PoseConfig)
     preset: Preset = "default"
     """Where the settings came from that no flag named (gsopt/presets.py)."""
     iterations: int = 7000

@@ -57,6 +57,14 @@ class Guidance(GuidanceConfig):
 
 
 @dataclass(frozen=True)
+class Poses(settings.PoseConfig):
+    """Correct the poses of the input views while learning."""
+
+    refine: Annotated[bool, arg(name="refine-poses", prefix_name=False)] = False
+    """Learn a small correction of every input view's pose; held-out views stay where they are."""
+
+
+@dataclass(frozen=True)
 class Flags:
     """Learn Gaussians from the posed images in DATA and write splats, metrics and a report to a run directory."""
 
@@ -108,6 +116,7 @@ class Flags:
     sparse: settings.SparseConfig = field(default_factory=settings.SparseConfig)
     schedule: settings.ScheduleConfig = field(default_factory=settings.ScheduleConfig)
     guidance: Guidance = field(default_factory=Guidance)
+    poses: Poses = field(default_factory=Poses)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -222,6 +231,7 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
         sparse=flags.sparse,
         schedule=flags.schedule,
         guidance=guidance_config(flags.guidance),
+        poses=settings.PoseConfig(**dataclasses.asdict(flags.poses)),
         preset=flags.preset,
         iterations=flags.iterations,
         seed=flags.seed,
