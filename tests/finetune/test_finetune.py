@@ -1,4 +1,4 @@
-"""From scenes to a prior that guides a run: what the folder is, what it refuses, and that training resumes to the bit."""
+"""From scenes to a prior that guides a run: what its folder is, what is refused, and that training resumes exactly."""
 
 from __future__ import annotations
 
