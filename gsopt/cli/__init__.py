@@ -13,6 +13,7 @@ from gsopt.errors import GsoptError, UsageError
 
 VERBS = {
     "sfm": "find the poses of photos or a video",
+    "prompts": "turn an expert's words into the prompts that guide a reconstruction",
     "train": "learn Gaussians from posed images",
     "render": "draw a finished run as images or a video",
     "eval": "judge a finished run by its held-out views",

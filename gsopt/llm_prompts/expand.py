@@ -109,6 +109,8 @@ def _negatives(template: Template, wish: Wish) -> Iterator[Prompt]:
 def fitted(phrase: str, wish: Wish, counter: Counter) -> str:
     """The phrase with the notes in it; as many of their clauses as CLIP reads."""
     notes = " ".join(wish.notes.split()).rstrip(".;, ")
+    if "{a_object}" in phrase and content(notes) == content(wish.object):
+        phrase = phrase.removesuffix(": {notes}")  # they say no more than the noun does
     clauses = re.split(r"(?<=[,;.])\s+", notes)
     values = {"object": wish.object, "a_object": with_article(wish.object)}
     for count in range(len(clauses), 0, -1):
