@@ -2,7 +2,7 @@
 
 A view with cam_from_world V is replaced by exp(xi) V, xi = (omega, tau): the world as this camera sees it is turned by
 omega about the camera and shifted by tau. No kernel has to differentiate a camera: turning and shifting the Gaussians
-as the view sees them draws the same picture, so dL/dxi follows from dL/dmeans and dL/dquats (docs/math.md, "Poses").
+as the view sees them draws the same picture, so dL/dxi follows from dL/dmeans and dL/dquats (docs/math.md, eq. 23).
 Color is the one thing that does not move along: it is looked up in the world's direction from camera to Gaussian,
 which a camera that turns on the spot does not change. What dL/dmeans owes to it is taken out for omega; for tau it
 belongs in. Nothing is neglected but the edges of the rasterizer's culling.
@@ -111,7 +111,7 @@ class PoseRefinement:
 def pose_gradient(
     viewmat: Float[Tensor, "4 4"], gaussians: Gaussians, gradients: Gradients, sh_degree: int
 ) -> Float[Tensor, "6"]:
-    """dL/d(omega, tau) at 0 of the picture that exp(xi) · viewmat sees (docs/math.md, "Poses"); float64."""
+    """dL/d(omega, tau) at 0 of the picture that exp(xi) · viewmat sees (docs/math.md, eq. 23); float64."""
     rows = seen_rows(gradients)
     means, rotations = gaussians.means[rows].double(), gaussians.quats[rows].double()
     v_means, v_quats = gradients.means[rows].double(), gradients.quats[rows].double()
@@ -151,7 +151,7 @@ def whitening(viewmat: Float[Tensor, "4 4"], means: Float[Tensor, "M 3"]) -> Flo
     """(S + damping · diag S)^(-1/2) where S = mean of J^T J over the Gaussians seen, J = d(direction)/d(xi).
 
     Turning about the camera and shifting it nearly look the same; in xi = W u every direction of u shifts the picture
-    by about as much, and Adam goes straight (preconditioned cameras: Park et al. 2023, "CamP", eq. 8).
+    by about as much, and Adam goes straight (docs/math.md, eq. 24; preconditioned cameras: Park et al. 2023, "CamP").
     """
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     points = points[points[:, 2] >= TOO_NEAR * points[:, 2].median()]
