@@ -1,0 +1,133 @@
+"""What guidance changes on objects no prior was trained on: the same run without it and with it, held-out metrics.
+
+    python benchmarks/guidance.py SCENES... -o FILE.json [--arm off default ...] [--views 4 6 8] [--seeds 3]
+                                  [--prior PRIOR] [--iterations 2000] [--draw]
+
+SCENES are posed scenes with held-out views, or folders of them. Every arm is one run from the same first Gaussians with
+the same steps; runs that have a record in FILE are not made again. The table pairs every arm with `off`, object by
+object. --draw prints it from FILE without running anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+from gsopt.benchmark.machine import machine
+from gsopt.cli import main as gsopt
+from gsopt.events import to_json, write_atomic
+
+ARMS: dict[str, list[str]] = {
+    "off": ["--lambda-sds", "0"],
+    "default": [],
+    "default, no guard": ["--guidance.guard-views", "0"],
+    "recon": ["--guidance.policy", "recon", "--guidance.guard-views", "0"],
+    "sds": ["--guidance.policy", "sds", "--guidance.guard-views", "0"],
+    "sds, no references": ["--guidance.policy", "sds", "--guidance.guard-views", "0", "--guidance.references", "0"],
+}
+METRICS = ("psnr", "ssim", "lpips_alex")
+
+
+def scenes(roots: list[Path]) -> list[Path]:
+    """Folders with held-out views."""
+    found = [p for root in roots for p in (root, *sorted(root.iterdir()))]
+    return [p for p in found if (p / "transforms_test.json").is_file()]
+
+
+def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """One run and what it came to."""
+    shutil.rmtree(folder, ignore_errors=True)
+    flags = ["--views", str(views), "--seed", str(seed), "--iterations", str(options.iterations), "--threads", "1"]
+    flags += ["--checkpoint-every", "0", "--preview-every", "0", *ARMS[arm], *options.flag]
+    if arm != "off" and options.prior:
+        flags += ["--prior", options.prior]
+    began = time.process_time()
+    code = gsopt(["train", str(scene), "-m", str(folder), *flags])
+    if code:
+        raise SystemExit(f"{scene.name}, {views} views, {arm}: gsopt train ended with {code}")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    guidance = json.loads((folder / "config.json").read_text()).get("guidance", {})
+    summary = folder / "guidance" / "summary.json"
+    return {
+        "scene": scene.name,
+        "views": views,
+        "seed": seed,
+        "arm": arm,
+        "iterations": options.iterations,
+        **{name: metrics["mean"][name] for name in METRICS},
+        "cpu_seconds": round(time.process_time() - began, 1),
+        "n_gaussians": metrics["n_gaussians"],
+        "settings": guidance,
+        "guidance": json.loads(summary.read_text()) if summary.exists() else None,
+    }
+
+
+def key(record: dict[str, Any]) -> str:
+    return f"{record['scene']} {record['views']} {record['seed']} {record['arm']} {record['iterations']}"
+
+
+def draw(records: list[dict[str, Any]]) -> str:
+    """Markdown: every arm against `off`, by number of input views; mean difference, its standard error, the worst."""
+    off = {(r["scene"], r["views"], r["seed"]): r for r in records if r["arm"] == "off"}
+    lines = [
+        "| views | arm | runs | PSNR | ΔPSNR | worst ΔPSNR | SSIM | ΔSSIM | LPIPS | ΔLPIPS | CPU s |",
+        "|---" * 11 + "|",
+    ]
+    for views in sorted({r["views"] for r in records}):
+        for arm in dict.fromkeys(r["arm"] for r in records):
+            rows = [r for r in records if r["views"] == views and r["arm"] == arm]
+            pairs = [(r, off[r["scene"], r["views"], r["seed"]]) for r in rows if (r["scene"], views, r["seed"]) in off]
+            if not pairs:
+                continue
+            cells = [f"{views}", arm, f"{len(pairs)}"]
+            for name in METRICS:
+                change = [a[name] - b[name] for a, b in pairs]
+                mean = sum(change) / len(change)
+                error = math.sqrt(sum((c - mean) ** 2 for c in change) / max(1, len(change) - 1) / len(change))
+                digits = 2 if name == "psnr" else 4
+                cells += [
+                    f"{sum(a[name] for a, _ in pairs) / len(pairs):.{digits}f}",
+                    f"{mean:+.{digits}f} ± {error:.{digits}f}",
+                ]
+                if name == "psnr":
+                    cells.append(f"{min(change):+.2f}")
+            cells.append(f"{sum(a['cpu_seconds'] for a, _ in pairs) / len(pairs):.0f}")
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="*")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--arm", nargs="*", choices=list(ARMS), default=["off", "default"])
+    parser.add_argument("--views", type=int, nargs="*", default=[4, 6, 8])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--prior", default="")
+    parser.add_argument("--iterations", type=int, default=2000)
+    parser.add_argument("--flag", nargs="*", default=[], help="further flags of gsopt train, without their dashes=")
+    parser.add_argument("--runs", type=Path, default=Path("runs/guidance"))
+    parser.add_argument("--draw", action="store_true")
+    options = parser.parse_args()
+    document = json.loads(options.out.read_text()) if options.out.exists() else {"machine": machine(), "runs": []}
+    known = {key(record): record for record in document["runs"]}
+    for seed in range(0 if options.draw else options.seeds):
+        for scene in scenes(options.scenes):
+            for views in options.views:
+                for arm in options.arm:
+                    wanted = {"scene": scene.name, "views": views, "seed": seed, "arm": arm}
+                    name = key({**wanted, "iterations": options.iterations})
+                    if name in known:
+                        continue
+                    known[name] = run(scene, views, seed, arm, options, options.runs / name.replace(" ", "_"))
+                    write_atomic(options.out, to_json({**document, "runs": list(known.values())}))
+    print(draw(list(known.values())))
+
+
+if __name__ == "__main__":
+    main()
