@@ -1,6 +1,6 @@
 # make demo: train on the scene that ships with gsopt and write a report.
 # make test: lint, type-check and test.   make lint: only the first two.
-# make bench: measure the kernels.   make stress, make sanitize: the slow checks of the rasterizer.
+# make bench: measure kernels and scenes.   make stress, make sanitize: the slow checks of the rasterizer.
 # Each makes .venv when it is missing and installs again when pyproject.toml, constraints.txt or the C++ sources change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -27,23 +27,29 @@ demo: $(VENV)/.for-demo
 test: lint
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2
 
-# Rewrites docs/performance.md and what it quotes; half an hour. Alone on the machine the wall times mean something.
+# Rewrites docs/performance.md and what it quotes; an hour. Alone on the machine the wall times mean something.
+# What every skip saves takes hours and data of its own: python benchmarks/skips.py --root DATA --draw.
 bench: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json benchmarks/results/kernels.json --parts cases growth accuracy
 	$(PY) -m gsopt bench draw --json benchmarks/results/kernels.json
+	OMP_NUM_THREADS=1 $(PY) -m gsopt bench scenes --json benchmarks/results/presets.json
+	$(PY) -m gsopt bench draw --json benchmarks/results/presets.json
 	OMP_NUM_THREADS=1 $(PY) benchmarks/stress.py
 
 # The stress suite in full: five million Gaussians, 100,000 steps at each of four hostile learning rates.
 stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
-# The rasterizer's tests on a build that stops at the first bad address or undefined behavior. -P: not the sources' gsopt.
+# The rasterizer's tests on a build that stops at the first bad address or undefined behavior. -S and -P: neither the
+# editable install nor the sources are to be imported instead of it.
 sanitize: $(VENV)/.for-test
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
 	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" .
-	LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)" \
-	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 PYTHONPATH=build/sanitized \
-	  $(PY) -P -m pytest tests/raster
+	export LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)" \
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 \
+	  PYTHONPATH="build/sanitized:$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"; \
+	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
+	$(PY) -S -P -m pytest tests/raster
 
 lint: $(VENV)/.for-test
 	$(PY) -m ruff check .
