@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gsopt import check
 from gsopt._optional import require
 from gsopt.errors import InputError, UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import write_atomic
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.llm_prompts.distinct import without_repetitions
 from gsopt.llm_prompts.expand import Wish, expand, filled_up, own_words
@@ -116,7 +117,7 @@ def raw_file(output: Path) -> Path:
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """The conversation as JSON in ASCII: whatever the model said, opening the file does nothing to a terminal."""
-    write_atomic(path, to_json(record).decode().encode("ascii", "backslashreplace"))
+    write_atomic(path, (json.dumps(record, indent=1, ensure_ascii=True) + "\n").encode("ascii"))
 
 
 def scored(made: PromptSet, job: Job, views: Sequence[Image.Image]) -> PromptSet:
