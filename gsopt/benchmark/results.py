@@ -1,4 +1,4 @@
-"""kernels.json: read, merged with what was measured now, checked, written whole."""
+"""Result files: read, merged with what was measured now, checked, written whole."""
 
 from __future__ import annotations
 
@@ -14,13 +14,20 @@ VERSION = 1
 EMPTY: dict[str, Any] = {"cases": [], "growth": [], "accuracy": {"scene": "", "rows": []}}
 
 
-def read(path: Path) -> dict[str, Any]:
+def read(path: Path, shape: schema.Schema = schema.KERNELS) -> dict[str, Any]:
     """An earlier result; InputError when the file is something else."""
+    found = parsed(path)
+    schema.require(found, shape, path.name)
+    return found
+
+
+def parsed(path: Path) -> dict[str, Any]:
+    """A JSON object, whatever it holds."""
     try:
         document = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read as JSON ({error}). Remove it, or name another file.") from error
-    schema.require(document, schema.KERNELS, path.name)
+    schema.require_object(document, path.name)
     found: dict[str, Any] = document
     return found
 
@@ -40,3 +47,17 @@ def merged(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[st
     """One record per case, number of threads and instruction set: the newer one, in order of the work in it."""
     records = {(record["case"], record["threads"], record["isa"]): record for record in [*old, *new]}
     return sorted(records.values(), key=lambda r: (r["width"] * r["height"], r["gaussians"], r["threads"], r["isa"]))
+
+
+def run_key(record: dict[str, Any]) -> tuple[Any, ...]:
+    """Records with the same key are of the same run of a scene."""
+    return record["scene"], record["kind"], record["preset"], record["iterations"], record["max_gaussians"]
+
+
+def update_runs(path: Path, command: str, machine: dict[str, Any], record: dict[str, Any]) -> None:
+    """Add one run of a scene to a file; an older record of the same run goes."""
+    old = read(path, schema.SCENES)["runs"] if path.exists() else []
+    runs = [run for run in old if run_key(run) != run_key(record)] + [record]
+    document = {"version": VERSION, "command": command, "machine": machine, "runs": runs}
+    schema.require(document, schema.SCENES)
+    write_atomic(path, to_json(document))

@@ -58,6 +58,25 @@ KERNELS = {
     "growth": [GROWTH],
     "accuracy": {"scene": str, "rows": [ACCURACY]},
 }
+QUALITY = {
+    "step": int,
+    "cpu_seconds": float,
+    "wall_seconds": float,
+    "gaussians": int,
+    "psnr": float,
+    "ssim": float,
+    "lpips_alex": (float, None),
+}
+"""Held-out quality of one moment of a run, and the time that its steps took until then."""
+RUN = {
+    "scene": str,
+    "kind": str,
+    "preset": str,
+    "iterations": int,
+    "max_gaussians": (int, None),
+    "points": [QUALITY],
+}
+SCENES = {"version": int, "command": str, "machine": MACHINE, "runs": [RUN]}
 
 
 def require(value: Any, schema: Schema, where: str = "result") -> None:
@@ -79,6 +98,11 @@ def require(value: Any, schema: Schema, where: str = "result") -> None:
             raise _mismatch(where, " or ".join(_name(option) for option in options), value)
 
 
+def require_object(value: Any, where: str) -> None:
+    """Raise InputError unless `value` is a JSON object."""
+    _require_type(value, dict, where)
+
+
 def _fits(value: Any, kind: Any) -> bool:
     if kind is None:
         return value is None
@@ -97,4 +121,4 @@ def _name(kind: Any) -> str:
 
 
 def _mismatch(where: str, want: str, got: Any) -> InputError:
-    return InputError(f"`{where}` must be {want}, got {str(got)[:80]!r}. Write it anew with `gsopt bench kernels`.")
+    return InputError(f"`{where}` must be {want}, got {str(got)[:80]!r}. Write it anew with `gsopt bench`.")

@@ -13,6 +13,7 @@ from tyro.conf import arg
 
 from gsopt import check
 from gsopt.errors import UsageError
+from gsopt.presets import Preset
 
 Part = Literal["cases", "growth", "accuracy"]
 
@@ -40,21 +41,46 @@ class Kernels:
 
 
 @dataclass(frozen=True)
+class Scenes:
+    """Train a scene with every preset and over a grid of budgets and lengths; quality over CPU time, one record per
+    run."""
+
+    json: Annotated[Path, arg(metavar="FILE")]
+    """Result file. What it holds of other scenes and runs is kept."""
+    data: Annotated[Path | None, arg(metavar="DATA")] = None
+    """Dataset folder; the scene that ships with gsopt when not given."""
+    resolution: Annotated[int, arg(aliases=["-r"])] = 1
+    """Divide width and height by this."""
+    eval: bool = False
+    """Hold out every 8th image when the dataset has no test split of its own."""
+    presets: tuple[Preset, ...] = ("draft", "default", "high")
+    """Each is judged several times on its way."""
+    counts: Annotated[tuple[str, ...], arg(metavar="N")] = ("3k", "6k", "12k", "24k")
+    """Budgets of Gaussians of the grid, e.g. 12k."""
+    lengths: Annotated[tuple[int, ...], arg(metavar="STEPS")] = (500, 1000, 2000, 4000)
+    """Lengths of the grid's runs. `--counts --lengths` without a number leave the grid out."""
+    missing: bool = False
+    """Only what the file has no record of."""
+
+
+@dataclass(frozen=True)
 class Draw:
     """Write the tables and charts of a page from a result file, without measuring anything."""
 
     json: Annotated[Path, arg(metavar="FILE")]
-    """What `gsopt bench kernels` wrote."""
+    """What `gsopt bench kernels` or `gsopt bench scenes` wrote."""
     page: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/performance.md")
-    """The page that has the block `kernels`; charts go to img/ beside it."""
+    """The page that has the block `kernels` or `scenes`; charts go to img/ beside it."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Measure or draw, say where it went, and return 0."""
-    verbs: dict[str, Any] = {"kernels": Kernels, "draw": Draw}
+    verbs: dict[str, Any] = {"kernels": Kernels, "scenes": Scenes, "draw": Draw}
     flags = tyro.extras.subcommand_cli_from_dict(verbs, prog="gsopt bench", description=__doc__, args=list(argv))
     if isinstance(flags, Draw):
         return draw(flags)
+    if isinstance(flags, Scenes):
+        return scenes(flags, argv)
     return kernels(flags, argv)
 
 
@@ -116,12 +142,66 @@ def line(record: dict[str, Any]) -> str:
     )
 
 
+def scenes(flags: Scenes, argv: Sequence[str]) -> int:
+    """`gsopt bench scenes`."""
+    check.at_least("--resolution", flags.resolution, 1, "1 keeps the size, 2 halves it, and so on.")
+
+    from gsopt.benchmark import results, schema
+    from gsopt.benchmark import scenes as runs
+    from gsopt.benchmark.machine import machine
+
+    known = (
+        {results.run_key(run) for run in results.read(flags.json, schema.SCENES)["runs"]}
+        if flags.json.exists()
+        else set()
+    )
+    command = "gsopt bench " + shlex.join(argv)
+    for task in tasks(flags):
+        if flags.missing and task.key() in known:
+            continue
+        record = runs.measure(task)
+        results.update_runs(flags.json, command, machine(), record)
+        print(run_line(record), flush=True)
+    print(f"Written: {flags.json}")
+    return 0
+
+
+def tasks(flags: Scenes) -> list[Any]:
+    """The presets, then the grid, shortest first."""
+    from gsopt.benchmark.kernels import read_count
+    from gsopt.benchmark.scenes import Task
+    from gsopt.cli.demo import SCENE
+    from gsopt.config import DataConfig
+
+    data = DataConfig(str((flags.data or SCENE).absolute()), downscale=flags.resolution, eval=flags.eval)
+    name = "demo" if flags.data is None else flags.data.resolve().name
+    name += f"-{flags.resolution}" if flags.resolution > 1 else ""
+    found = [Task(name, data, preset) for preset in flags.presets]
+    counts = [read_count("--counts", count) for count in flags.counts]
+    grid = [
+        Task(name, data, iterations=steps, max_gaussians=count) for steps in sorted(flags.lengths) for count in counts
+    ]
+    return found + grid
+
+
+def run_line(record: dict[str, Any]) -> str:
+    """A run in one line of the printed table."""
+    last = record["points"][-1]
+    what = record["preset"] if record["kind"] == "curve" else f"at most {record['max_gaussians']:,}"
+    return (
+        f"{record['scene']} {what}: {last['step']:,} steps, {last['gaussians']:,} Gaussians, "
+        f"{last['cpu_seconds']:.1f} s CPU, {last['psnr']:.2f} dB"
+    )
+
+
 def draw(flags: Draw) -> int:
     """`gsopt bench draw`."""
-    from gsopt.benchmark import results
-    from gsopt.benchmark.kernel_page import write_page
+    from gsopt.benchmark import kernel_page, results, scene_page, schema
 
-    write_page(results.read(flags.json), flags.page)
+    if "runs" in results.parsed(flags.json):
+        scene_page.write_page(results.read(flags.json, schema.SCENES), flags.page)
+    else:
+        kernel_page.write_page(results.read(flags.json), flags.page)
     print(f"Written: {flags.page}")
     return 0
 

@@ -1,0 +1,128 @@
+"""Quality over time of whole runs: every preset as it goes on, and a grid of budgets and lengths."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsopt.config import DataConfig, DensityConfig, GuidanceConfig, TrainConfig
+from gsopt.errors import UsageError
+from gsopt.evaluation import evaluate_views
+from gsopt.formats import load_splats
+from gsopt.gaussians import Gaussians
+from gsopt.presets import with_preset
+from gsopt.raster.api import make_backend
+from gsopt.raster.backend import RasterSettings
+from gsopt.render import BACKGROUNDS
+from gsopt.training.loop import TrainResult, train
+
+LOOKS = 8
+"""How often a preset is judged on its way."""
+MOST_VIEWS = 16
+"""Held-out views that are judged, evenly spread."""
+
+Event = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run of a scene."""
+
+    scene: str
+    """Its name in the tables."""
+    data: DataConfig
+    preset: str = "default"
+    iterations: int | None = None
+    """The preset's when not given."""
+    max_gaussians: int | None = None
+
+    @property
+    def kind(self) -> str:
+        """A curve over the run of a preset, or one point of the grid."""
+        return "curve" if self.iterations is None and self.max_gaussians is None else "grid"
+
+    def config(self) -> TrainConfig:
+        """One thread, no guidance; the grid looks only at the end."""
+        config = with_preset(
+            TrainConfig(data=self.data, guidance=GuidanceConfig(lambda_sds=0.0), threads=1), self.preset
+        )
+        iterations = self.iterations or config.iterations
+        looks = max(1, iterations // LOOKS) if self.kind == "curve" else 0
+        density = DensityConfig(max_gaussians=self.max_gaussians)
+        return replace(config, iterations=iterations, density=density, preview_every=looks, checkpoint_every=0)
+
+    def key(self) -> tuple[Any, ...]:
+        """What makes two records records of the same run."""
+        config = self.config()
+        return self.scene, self.kind, self.preset, config.iterations, self.max_gaussians
+
+
+def measure(task: Task) -> dict[str, Any]:
+    """Train and judge (`schema.RUN`); CPU time of the steps alone, without reading and judging."""
+    events: list[Event] = []
+    with tempfile.TemporaryDirectory() as folder:
+        result = train(task.config(), Path(folder) / "run", on_progress=events.append)
+        judge = Judge(task, result)
+        points = [
+            judge.point(load_splats(result.run / event["path"]), event["step"], *time_at(event["step"], events))
+            for event in events
+            if event["kind"] == "preview" and event["step"] < result.steps
+        ]
+    points.append(judge.point(result.gaussians, result.steps, result.cpu_seconds, result.train_seconds))
+    return {
+        "scene": task.scene,
+        "kind": task.kind,
+        "preset": task.preset,
+        "iterations": task.config().iterations,
+        "max_gaussians": task.max_gaussians,
+        "points": points,
+    }
+
+
+class Judge:
+    """Draws the held-out views of one run's scene and compares."""
+
+    def __init__(self, task: Task, result: TrainResult) -> None:
+        views = result.scene.test
+        if not views:
+            raise UsageError(f"{task.data.path} holds out no views, so nothing can be judged. Add --eval.")
+        count = min(MOST_VIEWS, len(views))
+        self._views = [views[i * len(views) // count] for i in range(count)]
+        self._backend = make_backend("auto", 1)
+        self._background = torch.tensor(BACKGROUNDS[task.data.background])
+
+    @torch.no_grad()
+    def point(self, gaussians: Gaussians, step: int, cpu: float, wall: float) -> dict[str, Any]:
+        """One point of a curve (`schema.QUALITY`)."""
+        judged = evaluate_views(
+            gaussians, self._views, self._backend, RasterSettings(), self._background, None, vgg=False
+        )
+        mean = {name: judged["mean"][name] for name in ("psnr", "ssim", "lpips_alex")}
+        times = {"cpu_seconds": round(cpu, 3), "wall_seconds": round(wall, 3)}
+        return {"step": step, **times, "gaussians": len(gaussians), **mean}
+
+
+def time_at(step: int, events: Sequence[Event]) -> tuple[float, float]:
+    """CPU and wall seconds when a step was done, between what was told before and after it."""
+    told = [(0, 0.0, 0.0), *((e["step"], e["cpu_seconds"], e["seconds"]) for e in events if e["kind"] == "progress")]
+    for before, after in itertools.pairwise(told):
+        if before[0] <= step <= after[0] > before[0]:
+            share = (step - before[0]) / (after[0] - before[0])
+            return before[1] + share * (after[1] - before[1]), before[2] + share * (after[2] - before[2])
+    return told[-1][1:]
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The Pareto front of (cost, quality): those points that none beats in both, by rising cost."""
+    best, kept = float("-inf"), []
+    for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):
+        if quality > best:
+            best = quality
+            kept.append((cost, quality))
+    return kept
