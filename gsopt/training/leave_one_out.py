@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gsopt.cameras import Cameras
 from gsopt.config import InitConfig, ScheduleConfig, TrainConfig
@@ -33,6 +35,8 @@ SIDE = 128
 """Longer side of the images of a short run, px, as near as halving comes."""
 GAUSSIANS = 5000
 WHITE = torch.ones(3)
+Aid = tuple[Prior, Conditioning, float, Cameras, Warn]
+"""What guides a short run: `make_guide`'s last arguments."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,8 @@ def judge_guidance(
     if len(scene.train) < 2:
         return Verdict(1.0, "not checked: there is only one input view", [])
     short = short_config(config, scene)
-    centers = torch.cat([view.camera.centers for view in scene.train])
-    left_out = sorted(farthest_points(centers, min(guidance.guard_views, len(scene.train))))
-    lefts = [_left(short, scene, index, backend) for index in left_out]
+    lefts = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
+    lefts = [replace(left, plain=_psnr(short, left, backend, None)) for left in lefts]
     trials = []
     for factor in FACTORS:
         made = [_psnr(short, left, backend, (prior, conditioning, factor * weight, front, warn)) for left in lefts]
@@ -107,16 +110,22 @@ def short_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     )
 
 
-def _left(config: TrainConfig, scene: Scene, index: int, backend: Backend) -> Left:
+def without(scene: Scene, index: int) -> Left:
+    """The scene without one of its input views; its PSNR is not measured yet."""
     others = tuple(view for i, view in enumerate(scene.train) if i != index)
-    left = Left(replace(scene, train=others), scene.train[index], 0.0)
-    return replace(left, plain=_psnr(config, left, backend, None))
+    return Left(replace(scene, train=others), scene.train[index], 0.0)
 
 
-def _psnr(
-    config: TrainConfig, left: Left, backend: Backend, guide: tuple[Prior, Conditioning, float, Cameras, Warn] | None
-) -> float:
-    """Of the left-out view after a short run on the others, dB."""
+def spread_views(scene: Scene, count: int) -> list[int]:
+    """Input views to leave out in turn, far from each other."""
+    centers = torch.cat([view.camera.centers for view in scene.train])
+    return sorted(farthest_points(centers, min(count, len(scene.train))))
+
+
+def short_run(
+    config: TrainConfig, left: Left, backend: Backend, guide: Aid | None
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+    """The left-out view after a short run on the others, 0..1 on white, and how it really looks."""
     degree = schedule.max_sh_degree(config, len(left.scene.train))
     gaussians, _ = first_gaussians(left.scene, config.init, degree, config.seed)
     guidance = None
@@ -128,4 +137,10 @@ def _psnr(
     target = Targets([left.view], WHITE, 0).get(0, schedule.downscale(1, config.schedule.coarse_until or ()), WHITE)
     settings = RasterSettings(sh_degree=degree, antialiased=config.antialiased)
     colors = backend.forward(trainer.model.gaussians, target.camera, settings, WHITE).colors
-    return min(100.0, float(psnr(colors.clamp(0, 1)[None], target.colors[None])))
+    return colors.clamp(0, 1), target.colors
+
+
+def _psnr(config: TrainConfig, left: Left, backend: Backend, guide: Aid | None) -> float:
+    """Of the left-out view after a short run on the others, dB."""
+    colors, truth = short_run(config, left, backend, guide)
+    return min(100.0, float(psnr(colors[None], truth[None])))
