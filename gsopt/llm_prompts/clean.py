@@ -18,6 +18,7 @@ LONGEST_RATIONALE = 300
 BAD_CATEGORIES = ("Cc", "Cf", "Cs", "Co", "Cn")
 """Control, invisible (zero width, direction), surrogate, private, unassigned."""
 EDGES = " \t\"'\u201c\u201d\u2018\u2019\u00ab\u00bb*_"
+STOPS = ".;,: "
 MARK = re.compile(r"^(?:[-*\u2022]|\(?\d{1,3}[.):])\s+")
 VIEW_END = re.compile(r"[,;]?\s*(?:in\s+|from\s+)?(?:an?\s+|the\s+)?(?:front|side|back|rear|top|overhead) view$", re.I)
 REFUSED = (
@@ -52,7 +53,8 @@ class Unusable(Exception):
 def cleaned(text: str, fewest_words: int = FEWEST_WORDS) -> str:
     """One clean line. Raises Unusable."""
     text = plain(text, LONGEST_CHARACTERS)
-    text = VIEW_END.sub("", MARK.sub("", text)).strip(EDGES).rstrip(".;,: ").strip(EDGES)
+    text = MARK.sub("", text).strip(EDGES).rstrip(STOPS).strip(EDGES)
+    text = VIEW_END.sub("", text).rstrip(STOPS).strip(EDGES)
     words = len(text.split())
     if not fewest_words <= words <= LONGEST_WORDS:
         raise Unusable(f"it has {words} words instead of {fewest_words} to {LONGEST_WORDS}")

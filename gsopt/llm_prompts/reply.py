@@ -86,6 +86,8 @@ def _read(document: dict[str, Any], wish: Wish, source: str, counter: Counter, k
             prompts.append(prompt)
         except Unusable as reason:
             problems.append(f"one entry of `{slot}` was refused: {reason}")
+    if not prompts and not problems:
+        problems.append("the lists are empty")
     return Read(tuple(prompts), tuple(dict.fromkeys(problems))[:MOST_PROBLEMS])
 
 

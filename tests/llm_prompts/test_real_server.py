@@ -79,6 +79,6 @@ def test_a_real_server_ends_in_valid_prompts_that_say_who_wrote_them(served, tmp
     for prompt in made.prompts:
         if prompt.source.startswith("llm:"):
             assert any(prompt.text[:20] in answer for answer in answers)
-    print(json.dumps([[p.source, p.text] for p in made.prompts], indent=1), *answers, sep="\n---\n")
+    print(json.dumps({"prompts": [[p.source, p.text] for p in made.prompts], "record": record}, indent=1))
     if not MODEL:  # a random model says nothing that can be used
         assert {prompt.source for prompt in made.prompts} == {"user", "template"}
