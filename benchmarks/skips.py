@@ -136,12 +136,8 @@ def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[s
         fork(Arm(arm.scene, "all", ()).folder(runs), run, *arm.without.setting)
     if arm.without is not None and arm.without.setting is not None:
         command = ["train", "--threads", "1", "--preview-every", "0"]
-    process = subprocess.Popen([sys.executable, "-m", "gsopt", *command, "-m", str(run), "--resume"])
-    while process.poll() is None:
-        keep_fork(run)
-        time.sleep(1)
-    if process.returncode != 0:
-        raise SystemExit(f"{arm.key} ended with exit code {process.returncode}; run this again to continue it.")
+    if not (run / "metrics.json").exists():  # it is written last
+        finish(arm, [sys.executable, "-m", "gsopt", *command, "-m", str(run), "--resume"], run)
     metrics = json.loads((run / "metrics.json").read_bytes())
     return {
         "scene": arm.scene,
@@ -155,6 +151,16 @@ def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[s
         "mean": {name: metrics["mean"][name] for name in METRICS},
         "machine": machine(),
     }
+
+
+def finish(arm: Arm, command: list[str], run: Path) -> None:
+    """Start or continue the run until it is judged."""
+    process = subprocess.Popen(command)
+    while process.poll() is None:
+        keep_fork(run)
+        time.sleep(1)
+    if process.returncode != 0:
+        raise SystemExit(f"{arm.key} ended with exit code {process.returncode}; run this again to continue it.")
 
 
 def changes_nothing(arm: Arm, runs: Path) -> bool:

@@ -66,10 +66,8 @@ def page_parts(result: dict[str, Any]) -> list[str]:
     parts = [f"`{result['command']}` on {machine['cpu']}; gsopt {machine['commit'] or machine['gsopt']}."]
     for scene in scenes(result):
         if curves := of(result, scene, "curve"):
-            parts += [
-                preset_table(scene, curves),
-                pictures(scene, [f"presets-{scene}-{w.lower()}" for w, _ in METRICS.values()]),
-            ]
+            names = [f"presets-{scene}-{word.lower()}" for word, _ in METRICS.values()]
+            parts += [preset_table(scene, curves), pictures(names)]
         if grid := of(result, scene, "grid"):
             parts += [front_table(scene, grid), pictures([f"pareto-{scene}"])]
     return parts
