@@ -135,14 +135,14 @@ def with_pictures(made: PromptSet, flags: Flags, drawing: Drawing) -> PromptSet:
     """With the pictures that were asked for; a prior that makes none says why."""
     if not drawing.count:
         return made
-    from gsopt.llm_prompts.illustrate import illustrate
+    from gsopt.llm_prompts.illustrate import PAGE, illustrate
 
     folder = flags.output.with_name(f"{flags.output.stem}-images")
     pictures, reason = illustrate(flags.prior, made.prompts, drawing, folder, say)
     if reason is not None:
         say(f"no pictures: {reason}")
         return made
-    say(f"{folder}: {len(pictures)} pictures; a review accepts or rejects them")
+    say(f"{folder / PAGE}: {len(pictures)} pictures; a review accepts or rejects them")
     return replace(made, images=pictures)
 
 

@@ -51,7 +51,7 @@ class Guidance(GuidanceConfig):
     negative: Annotated[UseAppendAction[tuple[str, ...]], arg(prefix_name=False, metavar="TEXT")] = ()
     """What it is not; give it once per prompt."""
     prompts: Annotated[str, arg(prefix_name=False, metavar="FILE")] = ""
-    """A prompts.json: prompts with weights, views and polarity."""
+    """A prompts.json: prompts with weights, views and polarity, and the reference images accepted there."""
     ref_image: Annotated[UseAppendAction[tuple[str, ...]], arg(prefix_name=False, metavar="FILE")] = ()
     """A further image of the object or of its like; give it once per image."""
 
@@ -248,17 +248,16 @@ def guidance_config(flags: Guidance) -> GuidanceConfig:
 
     Raises InputError for a prompt that cannot be used, UsageError for guidance without a prior: before any work.
     """
-    from gsopt.llm_prompts.schema import Prompt, read_prompts
+    from gsopt.llm_prompts.schema import Prompt, accepted_images
     from gsopt.sds.choice import choose
 
     for text in (*flags.prompt, *flags.negative):
         Prompt(text)
-    if flags.prompts:
-        read_prompts(Path(flags.prompts))
+    images = accepted_images(Path(flags.prompts)) if flags.prompts else ()
     values = dataclasses.asdict(flags)
     for name in ("prompts", "prior", "clip", "tiny_vae"):
         values[name] = absolute(values[name])
-    values["ref_image"] = tuple(absolute(path) for path in flags.ref_image)
+    values["ref_image"] = tuple(absolute(path) for path in (*flags.ref_image, *map(str, images)))
     config = GuidanceConfig(**values)
     choose(config)
     return config

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from gsopt.sds.diffusers_prior import DiffusersPrior
 
 MOST_STEPS = 1000
+PAGE = "index.html"
 
 Say = Callable[[str], None]
 
@@ -80,7 +82,24 @@ def illustrate(
         name = _free_name(folder)
         write_atomic(folder / name, _png(image))
         pictures.append(Picture(f"{folder.name}/{name}", prompt.text, prior.folder.name[-200:]))
+    write_atomic(folder / PAGE, contact_sheet(pictures).encode())
     return tuple(pictures), None
+
+
+def contact_sheet(pictures: Sequence[Picture]) -> str:
+    """A page that shows the pictures with their prompts; it lies beside them and loads nothing else."""
+    figures = "".join(
+        f'<figure><img src="{escape(Path(picture.file).name)}" alt="" width="320"><figcaption>'
+        f"{escape(Path(picture.file).name)}: {escape(picture.prompt)}</figcaption></figure>"
+        for picture in pictures
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" '
+        "content=\"default-src 'none'; img-src 'self' file:; style-src 'unsafe-inline'\"><title>Pictures from prompts"
+        "</title><style>body{font:15px system-ui;margin:24px}figure{display:inline-block;width:320px;margin:8px;"
+        "vertical-align:top}</style></head><body><h1>Pictures from prompts</h1><p>Made by a model. They guide nothing "
+        f"until they are accepted: gsopt prompts review FILE.</p>{figures}</body></html>\n"
+    )
 
 
 def _open(name: str) -> tuple[DiffusersPrior | None, str | None]:
