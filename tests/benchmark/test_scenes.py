@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt import cli
@@ -100,6 +100,7 @@ def test_times_lie_between_what_was_told() -> None:
     assert time_at(25, events) == (2.0, 6.0)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 9), st.floats(0, 9)), min_size=1, max_size=12))
 def test_nothing_beats_a_point_of_the_front_and_something_beats_the_rest(points: list[tuple[float, float]]) -> None:
     kept = front(points)
