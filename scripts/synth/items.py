@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,12 +50,21 @@ def of_paths(paths: Iterable[Path]) -> Iterator[Item]:
     """Files as they are named; folders with all meshes below them, named by their path in the folder."""
     for path in paths:
         if path.is_dir():
-            found = [Item(safe_id(m.relative_to(path).with_suffix("").as_posix()), m) for m in mesh_files(path)]
+            found = list(mesh_files(path))
             if not found:
                 raise InputError(f"The folder {path} holds no mesh. Give one that does, or name files.")
-            yield from found
+            yield from (Item(safe_id(i), mesh) for i, mesh in zip(ids_in(path, found), found, strict=True))
         else:
             yield Item(safe_id(path.stem), path)
+
+
+def ids_in(folder: Path, meshes: list[Path]) -> list[str]:
+    """Paths in `folder` without their suffix; with it where another mesh or a folder of meshes has the bare name."""
+    named = [mesh.relative_to(folder) for mesh in meshes]
+    bare = [name.with_suffix("").as_posix() for name in named]
+    taken = Counter(name.casefold() for name in bare)
+    taken.update({parent.as_posix().casefold() for name in named for parent in name.parents})
+    return [b if taken[b.casefold()] == 1 else name.as_posix() for b, name in zip(bare, named, strict=True)]
 
 
 def of_shapenet(root: Path, synsets: tuple[str, ...]) -> Iterator[Item]:

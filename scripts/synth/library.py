@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.errors import InputError
+from synth.cameras import shots
 from synth.crew import Job, Outcome, do_all
 from synth.export import write_json
 from synth.items import Item
@@ -37,10 +38,10 @@ def run(
     """Render every item into `out / item.id` and return the exit code: 0, or 3 when any failed.
 
     What `out` already holds of the same run is kept and not rendered again with `resume`. InputError when `out` holds
-    anything else; nothing there is touched then.
+    anything else, or when a file that the settings name cannot be read; nothing in `out` is touched then.
     """
     began = time.perf_counter()
-    header = {"version": VERSION, "settings": settings.record(), "seed": seed}
+    header = {"version": VERSION, "settings": settings.record(), "seed": seed, "files_sha256": files_used(settings)}
     open_folder(out, header, resume)
     todo = [item for item in items if not (out / item.id / RECORD).is_file()]
     failures = [failure for item in items if item not in todo for failure in changed(out, item)]
@@ -61,6 +62,21 @@ def run(
     for lost in failures:
         say(f"failed: {lost['id']}: {lost['reason']}")
     return FAILED if failures else 0
+
+
+def files_used(settings: Settings) -> dict[str, str]:
+    """Checksums of the files that every object needs, by flag. InputError when one of them cannot be used."""
+    if settings.layout == "file":
+        shots(settings, 0)
+    named = {"--cameras": settings.camera_file, "--lighting hdri": settings.hdri}
+    found = {}
+    for flag, name in named.items():
+        try:
+            if name is not None:
+                found[flag] = hashlib.sha256(Path(name).read_bytes()).hexdigest()
+        except OSError as error:
+            raise InputError(f"`{flag}` cannot read {name}: {error.strerror}. Check path and permissions.") from None
+    return found
 
 
 def say(text: str) -> None:
@@ -86,10 +102,10 @@ def check_same_run(out: Path, header: dict[str, Any], resume: bool) -> None:
     """InputError unless `out` was begun with the same settings and seed and `resume` says to go on."""
     try:
         before = json.loads((out / DATASET).read_text(encoding="utf-8"))
-        kept = {"seed": before["seed"], **before["settings"]}
+        kept = {"seed": before["seed"], **before["settings"], **before.get("files_sha256", {})}
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{out} is not empty and holds no run of synth_views. Choose another -o.") from None
-    asked = json.loads(json.dumps({"seed": header["seed"], **header["settings"]}))
+    asked = json.loads(json.dumps({"seed": header["seed"], **header["settings"], **header["files_sha256"]}))
     differing = [f"{k} {kept.get(k)!r}, now {v!r}" for k, v in asked.items() if kept.get(k) != v]
     if before.get("version") != header["version"] or differing:
         raise InputError(f"{out} holds a run with other settings ({'; '.join(differing)}). Choose another -o.")
@@ -137,7 +153,9 @@ def timings(outcomes: Sequence[Outcome], seconds: float) -> dict[str, Any]:
 def line_about(outcome: Outcome) -> str:
     if outcome.seconds is None:
         return f"{outcome.job.item.id}: {outcome.error}"
-    return f"{outcome.job.item.id}: {sum(outcome.seconds.values()):.1f} s"
+    record = json.loads((outcome.job.out / RECORD).read_text(encoding="utf-8"))
+    warnings = "".join(f"; {warning}" for warning in record.get("warnings", []))
+    return f"{outcome.job.item.id}: {sum(outcome.seconds.values()):.1f} s{warnings}"
 
 
 def write_whole(path: Path, content: Any) -> None:

@@ -128,7 +128,8 @@ def check_ply_vertices(mesh: Path, header: bytes) -> None:
 
 
 def check_obj(mesh: Path, size: int) -> list[str]:
-    """InputError when the last line breaks off; a warning for a material file that is not there."""
+    """InputError when the last line breaks off or faces name vertices that are not there, which importers drop; a
+    warning for a material file that is not there."""
     with mesh.open("rb") as file:
         start = file.read(MAX_HEADER)
         file.seek(max(0, size - 4096))
@@ -138,9 +139,27 @@ def check_obj(mesh: Path, size: int) -> list[str]:
     if len(last) - 1 < wanted or (wanted and last[-1].endswith(b"/")):
         raise InputError(f"{mesh} breaks off in its last line ({b' '.join(last)[:40]!r}). Export or copy it again.")
     check_numbers(mesh, rb"^[ \t]*v[ \t].*\b(?:nan|inf)")
+    check_obj_faces(mesh)
     lines = [line.strip().decode("utf-8", "replace") for line in start.splitlines() if line.startswith(b"mtllib ")]
     lost = [name for name in (line[len("mtllib ") :].strip() for line in lines) if not find_near(mesh, name)]
     return [f"the material file {name} is missing: surfaces are plain" for name in lost]
+
+
+def check_obj_faces(mesh: Path) -> None:
+    """InputError when a face names a vertex that the file does not hold, counted from either end."""
+    vertices = reach = 0
+    with mesh.open("rb") as file:
+        for words in (line.split() for line in file):
+            if words[:1] == [b"v"]:
+                vertices += 1
+            elif words[:1] == [b"f"]:
+                named = (word.partition(b"/")[0].removeprefix(b"-")[:18] for word in words[1:])
+                reach = max(reach, *(int(index) for index in named if index.isdigit()), 0)
+    if reach > vertices:
+        raise InputError(
+            f"{mesh} has a face at vertex {reach}, but only {vertices} vertices: it is cut short or broken. "
+            "Export or copy it again."
+        )
 
 
 def find_near(mesh: Path, name: str) -> Path | None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,15 +60,20 @@ class Views:
     """Pixels of all views that show something."""
 
 
-def load_bpy() -> Any:
-    """Blender's Python module, or MissingDependency with the line that installs it."""
-    try:
-        import bpy
-    except ImportError:
+def require_blender() -> None:
+    """MissingDependency, with the line that installs it, unless `bpy` is there; does not load it."""
+    if "bpy" not in sys.modules and find_spec("bpy") is None:
         raise MissingDependency(
             "synth_views needs Blender. Install its module with `pip install bpy` (4.2 to 5.0 want Python 3.11, "
             "5.1 and 5.2 want 3.13), or run `blender -b -P scripts/synth_views.py -- ...`."
-        ) from None
+        )
+
+
+def load_bpy() -> Any:
+    """Blender's Python module. MissingDependency without Blender, UsageError inside a Blender with windows."""
+    require_blender()
+    import bpy
+
     if not bpy.app.background:
         raise UsageError(
             "Rendering an object here would replace the open Blender file. Call `synth.library.run`, which starts "

@@ -72,8 +72,9 @@ def import_mesh(bpy: Any, mesh: Path) -> None:
     try:
         importers.get(mesh.suffix.lower(), bpy.ops.import_scene.gltf)(filepath=str(mesh.resolve()))
     except Exception as error:  # importers in C++ raise RuntimeError, those in Python whatever they stumbled over
-        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        raise InputError(f"Blender cannot read {mesh}: {reason[0]} Export it again or convert it.") from None
+        *_, reason = [type(error).__name__, *str(error).strip().splitlines()]
+        reason = reason.removeprefix("Error: ").rstrip(". ")
+        raise InputError(f"Blender cannot read {mesh}: {reason}. Export it again or convert it.") from None
 
 
 def append_scene(bpy: Any, filepath: str) -> None:

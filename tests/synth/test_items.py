@@ -23,6 +23,11 @@ def test_a_folder_gives_every_mesh_below_it(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("x")
     assert [item.id for item in items.of_paths([tmp_path])] == ["b", "sub/a", "sub/deep/c"]
+    for name in ("b.glb", "sub.ply"):  # would be the second b, and a folder that another object lies in
+        (tmp_path / name).write_text("x")
+    assert [i.id for i in items.unique(items.of_paths([tmp_path]))] == [
+        "b.OBJ", "b.glb", "sub/a", "sub/deep/c", "sub.ply"
+    ]  # fmt: skip
     void = tmp_path / "void"
     void.mkdir()
     with pytest.raises(InputError, match="no mesh"):
@@ -149,6 +154,8 @@ HOLLOW = {"accessors": [{"componentType": 5126, "type": "VEC3", "count": 2_000_0
         ("cut.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2"),
         ("cut2.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/"),
         ("cut3.obj", b"v 0 0 0\nv 1 0 "),
+        ("past the end.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 4/3\n"),
+        ("before the start.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n"),
         ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ("inf.obj", b"v 1 0 -inf\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ("nan.ply", PLY.format(2).replace("\n1\n", "\nnan\n").encode()),
@@ -178,6 +185,7 @@ def test_what_would_hang_or_mislead_blender_is_refused(name: str, content: bytes
         ("binary.ply", BINARY_PLY + struct.pack("<Bf", 1, 2.0)),
         ("nancy.obj", b"o nan inf\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3"),
         ("text.stl", b"solid x\n facet normal 0 0 1\n"),
+        ("negative.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1//9 -2//8 -3//7\n"),
         ("fine.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n\n"),
     ],
 )
