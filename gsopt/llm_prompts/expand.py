@@ -17,6 +17,8 @@ from gsopt.llm_prompts.templates import Template, fill
 from gsopt.llm_prompts.tokens import LONGEST, Counter
 
 SIDES: tuple[View, ...] = ("front", "side", "back", "top")
+DENIED = re.compile(r"\b(?:without|no|not|lacks|lacking|missing)\b[^,.;:\n]*", re.IGNORECASE)
+"""What the notes say is not there: "chair without armrests"."""
 FEWEST_WITH_SIDES = 6
 """Prompts from which on each side gets one of its own."""
 
@@ -80,8 +82,9 @@ def _one_side(template: Template, wish: Wish, side: View, counter: Counter) -> I
 
 def _known(template: Template, wish: Wish, view: View) -> Iterator[Prompt]:
     """`a femur, thinned cortex ...`: one prompt per word of the notes that the template knows; the noun's first."""
-    noun, said = content(wish.object), content(wish.notes)
-    entries = [word for word in template.words if word.view == view]
+    noun, said = content(wish.object), content(DENIED.sub("", wish.notes))
+    denied = content(" ".join(DENIED.findall(wish.notes))) - noun
+    entries = [word for word in template.words if word.view == view and not content(word.description) & denied]
     for wanted in (noun, said - noun):
         for entry in entries:
             word = next((word for word in entry.words if {stem(w) for w in WORD.findall(word)} <= wanted), None)

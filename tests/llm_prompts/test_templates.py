@@ -107,6 +107,20 @@ def test_what_the_template_knows_about_a_word_is_said_where_the_word_is_and_nowh
     assert "linea aspera" not in said("thigh")
 
 
+def test_what_the_notes_deny_is_not_said() -> None:
+    template = load_template("robotics")
+
+    def said(notes: str) -> str:
+        prompts = expand(template, Wish(notes, "chair", 12, 0), ESTIMATE)
+        return " ".join(prompt.text.replace(notes, "") for prompt in prompts)
+
+    assert "armrests" in said("chair with arms")
+    assert "armrests" not in said("chair without arms")
+    assert "backrest" in said("chair, oak")
+    assert "backrest" not in said("chair, no backrest, oak")
+    assert "wood grain" in said("chair, no backrest, oak")
+
+
 def test_negatives_never_deny_the_notes() -> None:
     template = load_template("environment")
     for notes in ("stone in water", "stone with grass", "polished stone"):
