@@ -32,8 +32,9 @@ LEAST_STEP = 0.008
 """A shorter way from the anchor frame is trembling, share of the longer side (2 px at SMALL_SIDE)."""
 CENTRAL_SHARE = 0.6
 """Middle part of a stretch of motion in which its sharpest frame is looked for: keeps neighbors apart."""
-LOST_PEAK = 0.05
-"""A correlation peak below this means that two frames have nothing in common: a cut, or a jump."""
+LOST_PEAK = 6.0
+"""A correlation peak below this, over the root of a tile's pixels, means that two frames have nothing in common: a cut,
+or a jump. Noise peaks at 4.5 to 5, pictures of one thing that moved a little at 6 and far above."""
 _WRITTEN_QUALITY = 95
 
 
@@ -117,7 +118,7 @@ def motion_between(before: Float32[np.ndarray, "h w"], after: Float32[np.ndarray
     corners = [(row * height, column * width) for row in range(TILES) for column in range(TILES)]
     tiles = [np.s_[top : top + height, left : left + width] for top, left in corners]
     shifts, peaks = zip(*(_correlate(before[tile], after[tile], window) for tile in tiles), strict=True)
-    if float(np.median(peaks)) < LOST_PEAK:
+    if float(np.median(peaks)) < LOST_PEAK / np.sqrt(height * width):
         return MOST_MOTION
     return float(np.median(np.linalg.norm(np.array(shifts), axis=1))) / max(before.shape)
 
