@@ -19,6 +19,8 @@ from gsopt.llm_prompts.tokens import Counter
 REPAIRS = 2
 TOKENS_PER_PROMPT = 90
 """Allowed per prompt of the reply: 40 words, the reason and the JSON around them."""
+MORE_ROOM = 4
+"""How much longer an answer may be after a model spent all on its thoughts."""
 LONGEST_QUOTE = 8000
 """Characters of the model's own answer that a repair sends back to it."""
 LONGEST_RECORD = 64 << 10
@@ -105,6 +107,8 @@ def converse(server: Server, request: Request, counter: Counter, say: Say) -> Co
         prompts += trimmed(read.prompts, prompts, wish)
         problems = read.problems + (("the answer was cut off: too long",) if answer.finish == "length" else ())
         rounds.append(_round(messages, answer, problems))
+        if answer.finish == "length" and is_thought(answer.text):
+            way.room *= MORE_ROOM
         lacking = missing(prompts, wish)
         say(f"answer {attempt + 1}: {len(prompts)} prompts so far, {sum(lacking.values())} missing")
         if not lacking:
@@ -112,6 +116,11 @@ def converse(server: Server, request: Request, counter: Counter, say: Say) -> Co
         messages = [*messages[:2], *repair_messages(answer, replace(read, problems=problems), lacking, wish)]
     notes += way.notes + [problem for r in rounds for problem in r.problems]
     return Conversation(prompts, tuple(rounds), tuple(dict.fromkeys(notes)))
+
+
+def is_thought(text: str) -> bool:
+    """Whether a model that reasons first was cut off before it began to answer."""
+    return not text.strip() or ("<think" in text and "</think" not in text)
 
 
 def source_of(model: str) -> str:
@@ -148,6 +157,8 @@ class Way:
         if request.pictures:
             self._steps.append("words only")
         self.notes: list[str] = []
+        self.room = 1
+        """Factor on the length that an answer may have."""
 
     def ask(self, messages: list[dict[str, Any]]) -> Answer:
         """One answer. Raises Refusal."""
@@ -168,7 +179,7 @@ class Way:
         body: dict[str, Any] = {"messages": [_with_pictures(messages[0], ()), _with_pictures(messages[1], pictures)]}
         body["messages"] += messages[2:]
         if step in ("all", "without a schema"):
-            most = 200 + TOKENS_PER_PROMPT * sum(request.wish.slots.values())
+            most = self.room * (200 + TOKENS_PER_PROMPT * sum(request.wish.slots.values()))
             body |= {"temperature": request.temperature, "top_p": 0.95, "seed": request.seed, "max_tokens": most}
         if step == "all":
             schema = {"name": "prompts", "strict": True, "schema": reply_schema(request.wish.slots)}

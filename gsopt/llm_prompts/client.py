@@ -220,7 +220,7 @@ def _sent(request: urllib.request.Request, server: Server) -> bytes | Refusal:
             return _bounded(response, server)
     except urllib.error.HTTPError as error:
         return _refused(error, server)
-    except (OSError, http.client.HTTPException, ValueError) as error:
+    except Exception as error:  # whatever the library raises has to reach the thread that waits
         reason = getattr(error, "reason", None) or error
         text = printable(redacted(str(reason) or type(error).__name__, server), 200)
         return Refusal(f"No usable answer came from {server.url} ({text}). {REMEDY}")

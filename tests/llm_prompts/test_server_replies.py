@@ -64,7 +64,7 @@ def test_an_answer_ends_in_valid_prompts_or_in_a_clear_error(tmp_path: Path, cap
 
 
 def test_the_docs_list_exactly_these_cases() -> None:
-    rows = [f"| {case.does} | {case.ends} |" for case in CASES]
+    rows = [f"| {case.does} | `{case.ends}` |" for case in CASES]
     page = PAGE.read_text(encoding="utf-8")
     if os.environ.get("GSOPT_WRITE_DOCS"):
         begin, end = page.index("<!-- replies -->"), page.index("<!-- end of replies -->")
@@ -128,6 +128,14 @@ def test_structured_output_is_asked_for_with_the_schema_of_what_is_wanted(tmp_pa
     assert not json_schema.is_valid({**GOOD, "front": []}, wanted)
     assert server.asked[0]["headers"]["Authorization"] == f"Bearer {KEY}"
     assert server.asked[0]["path"] == "/v1/chat/completions"
+
+
+@pytest.mark.parametrize("thought", [None, "", "<think>The chair"])
+def test_a_model_that_spent_all_on_its_thoughts_gets_more_room(tmp_path: Path, thought: str | None) -> None:
+    with serving([completion(thought, "length"), VALID]) as server:
+        assert run(tmp_path, server.url) == 0
+    first, second = (request["body"]["max_tokens"] for request in server.asked)
+    assert second == 4 * first
 
 
 def test_pictures_go_to_a_server_that_takes_them_and_are_left_out_where_not(tmp_path: Path, photo: Path) -> None:
