@@ -72,10 +72,10 @@ class Run:
 class Follower:
     """Reads a run's events as they come."""
 
-    def __init__(self, path: Path, job: jobs.Job | None = None) -> None:
+    def __init__(self, path: Path, job: jobs.Job | None = None, told: int = 0) -> None:
         self.run = Run(path)
         self.job = job
-        self._offset = 0
+        self._offset = told
         self._broken = False
 
     def poll(self) -> Run:
@@ -201,6 +201,14 @@ def inside(run: Path, name: Any) -> str:
 
 def thinned(history: list[tuple[int, float]]) -> list[tuple[int, float]]:
     return history if len(history) <= 400 else history[::2]
+
+
+def length(run: Path) -> int:
+    """Bytes of events so far: where a session that is about to begin will begin."""
+    try:
+        return (run / "events.jsonl").stat().st_size
+    except OSError:
+        return 0
 
 
 def ask_to_stop(run: Path) -> None:

@@ -1,0 +1,96 @@
+"""Splat files come in without holding Blender up: read in a thread, handed over bit by bit by the timer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from . import splat_object
+from .core import run as runs
+from .core import statistics
+from .core.errors import GsoptError, InputError
+from .core.ply import read_ply
+from .core.splats import Splats
+from .core.spz import read_spz
+
+SLICE = 0.02
+"""Seconds of the main thread that a tick may take."""
+SUMMARIES: dict[str, statistics.Summary] = {}
+"""By name of the mesh; made anew when asked for."""
+
+
+def splat_file(path: Path) -> Path:
+    """The file to read: itself, or what a run directory has. InputError where there is none."""
+    if not path.is_dir():
+        return path
+    found = runs.splats_of(path)
+    if found is None:
+        raise InputError(f"{path} holds no splats yet. Wait for the first preview, or choose another run.")
+    return found
+
+
+def read(path: Path, progress: Callable[[float], None] = lambda share: None) -> Splats:
+    """The splats of a PLY or SPZ file."""
+    reader = {".ply": read_ply, ".spz": read_spz}.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path.name} is neither .ply nor .spz. Convert it with `gsopt export`.")
+    return reader(path, progress)
+
+
+class Loading:
+    """One file on its way into an object."""
+
+    def __init__(self, path: Path, most: int, finish: Callable[[Any, statistics.Summary], None]) -> None:
+        self.path, self.most, self.finish = path, most, finish
+        self.share = 0.0
+        self.error = ""
+        self.over = False
+        self._read: tuple[Splats, statistics.Summary] | None = None
+        self._steps: Iterator[Any] | None = None
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        try:
+            splats = read(self.path, self._tell)
+            splats = splats.at_most(self.most) if self.most else splats
+            self._read = splats, statistics.summary(splats)
+        except GsoptError as error:
+            self.error = str(error)
+        except MemoryError:
+            self.error = f"{self.path.name} does not fit into memory. Close other files, or thin it with `gsopt`."
+        except Exception as error:
+            self.error = f"{self.path.name} could not be read: {error!r:.200}. Please report it."
+
+    def _tell(self, share: float) -> None:
+        self.share = share
+
+    def advance(self) -> None:
+        """Hand over for at most a slice of time; afterwards `over` tells whether all is done."""
+        if self._thread.is_alive():
+            return
+        if self.error or self._read is None:
+            self.over = True
+            return
+        if self._steps is None:
+            self._steps = splat_object.mesh_in_steps(bpy, self.path.stem, self._read[0])
+        until = time.perf_counter() + SLICE
+        for mesh in self._steps:
+            if mesh is not None:
+                SUMMARIES[mesh.name] = self._read[1]
+                self.over = True
+                self.finish(mesh, self._read[1])
+                return
+            if time.perf_counter() > until:
+                return
+
+    def wait(self) -> None:
+        """To the end, where there is no window to hold up."""
+        self._thread.join()
+        while not self.over:
+            self.advance()

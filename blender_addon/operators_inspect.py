@@ -1,0 +1,323 @@
+"""4 Inspect: bring splats and cameras in, look at them, filter, delete, export."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from . import loading, splat_object, watching
+from .core import dataset, statistics
+from .core.cameras import View, read_views
+from .core.errors import InputError, UsageError
+from .core.files import read_json
+from .core.ply import write_ply
+from .material import let_cycles_see_through
+from .preferences import absolute
+from .telling import Telling, Waiting
+
+MOST_CAMERAS = 200
+UPRIGHT = Matrix.Rotation(-math.pi / 2, 4, "X")
+
+
+def active_splats(context: Any) -> Any:
+    """The active object, or the only splats there are. UsageError where that is unclear."""
+    active = context.view_layer.objects.active
+    if splat_object.is_splats(active):
+        return active
+    found = [o for o in context.scene.objects if splat_object.is_splats(o) and not o.get("gsopt_live")]
+    if len(found) != 1:
+        raise UsageError(f"{len(found)} objects hold splats. Select the one that is meant, or import one.")
+    return found[0]
+
+
+def data_of(run: Path) -> Path | None:
+    """The dataset that a run learned from."""
+    try:
+        return Path(read_json(run / "config.json")["config"]["data"]["path"])
+    except (InputError, KeyError, TypeError):
+        return None
+
+
+def frame(settings: Any, data: Path | None) -> Matrix:
+    """From the splats' axes to the scene's."""
+    if settings.up == "MINUS_Y":
+        return UPRIGHT.copy()
+    if settings.up == "DATASET" and data is not None:
+        found = dataset.scene_from_dataset(data)
+        if found is not None:
+            return Matrix(found.tolist())
+    return Matrix()
+
+
+class GSOPT_OT_import_splats(Waiting, bpy.types.Operator):
+    """Import splats: a run, a .ply or an .spz"""
+
+    bl_idname = "gsopt.import_splats"
+    bl_label = "Import Splats"
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
+    filter_glob: bpy.props.StringProperty(default="*.ply;*.spz", options={"HIDDEN"})  # type: ignore[valid-type]
+    from_run: bpy.props.BoolProperty(name="From the Run", default=False, options={"SKIP_SAVE"})  # type: ignore[valid-type]
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        if self.from_run:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def do(self, context: Any) -> str:
+        scene, settings = context.scene, context.scene.gsopt
+        if settings.job_import.state == "RUNNING" and "import" in watching._loads:
+            raise UsageError("A file is being imported. Wait for it.")
+        source = absolute(settings.run_path if self.from_run else self.filepath)
+        path = loading.splat_file(source)
+        run = source if source.is_dir() else path.parent
+        matrix, name = frame(settings, data_of(run)), scene.name_full
+
+        def finish(mesh: Any, summary: statistics.Summary) -> None:
+            target = bpy.data.scenes[name]
+            thing = watching.add_object(target, mesh, summary, str(source), settings_of(name).display)
+            thing.matrix_world = matrix
+            for other in [o for o in target.objects if o.get("gsopt_live")]:
+                bpy.data.objects.remove(other)
+            let_cycles_see_through(target)
+            activate(thing)
+            if not bpy.app.background:
+                with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+                    bpy.ops.ed.undo_push(message="Import Splats")
+
+        found = watching.load(scene, path, finish)
+        if self.waits:
+            found.wait()
+            watching.look(scene)
+            if found.error:
+                raise InputError(found.error)
+            return f"{path.name} imported"
+        return f"Reading {path.name}"
+
+
+def settings_of(scene: str) -> Any:
+    return bpy.data.scenes[scene].gsopt
+
+
+def activate(thing: Any) -> None:
+    layer = bpy.context.view_layer
+    layer.update()
+    if thing.name in layer.objects:
+        for other in layer.objects.selected:
+            other.select_set(False)
+        thing.select_set(True)
+        layer.objects.active = thing
+
+
+class GSOPT_OT_import_cameras(Telling, bpy.types.Operator):
+    """Import the dataset's cameras with their pictures as backgrounds"""
+
+    bl_idname = "gsopt.import_cameras"
+    bl_label = "Import Cameras"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    directory: bpy.props.StringProperty(subtype="DIR_PATH")  # type: ignore[valid-type]
+
+    def do(self, context: Any) -> str:
+        settings = context.scene.gsopt
+        data = absolute(self.directory) if self.directory else None
+        if data is None and settings.run_path:
+            data = data_of(absolute(settings.run_path))
+        if data is None and settings.dataset:
+            data = absolute(settings.dataset)
+        if data is None:
+            raise UsageError("No dataset is known. Choose one, or attach to a run.")
+        views = read_views(data)
+        home = bpy.data.collections.new("gsopt cameras")
+        context.scene.collection.children.link(home)
+        matrix = frame(settings, data)
+        for view in views[:MOST_CAMERAS]:
+            add_camera(home, view, matrix, settings.picture)
+        return f"{min(len(views), MOST_CAMERAS)} of {len(views)} cameras"
+
+
+def add_camera(home: Any, view: View, matrix: Matrix, alpha: float) -> Any:
+    """A camera object with its picture. The frame may scale the scene; a camera has a place and a direction only."""
+    name = f"{view.split} {view.name}"
+    lens = bpy.data.cameras.new(name)
+    lens.sensor_fit = "HORIZONTAL"
+    lens.angle = view.angle_x
+    lens.shift_x, lens.shift_y = view.shift
+    place, turn, scale = (matrix @ Matrix(view.world_from_cam.tolist())).decompose()
+    lens.display_size = 0.1 * scale.x
+    lens.clip_start, lens.clip_end = 0.01 * scale.x, 1000 * scale.x
+    camera = bpy.data.objects.new(name, lens)
+    camera.matrix_world = Matrix.Translation(place) @ turn.to_matrix().to_4x4()
+    camera["gsopt_size"] = [view.width, view.height]
+    home.objects.link(camera)
+    if view.image.is_file():
+        picture = lens.background_images.new()
+        picture.image = bpy.data.images.load(str(view.image), check_existing=True)
+        picture.alpha = alpha
+        lens.show_background_images = True
+    return camera
+
+
+class GSOPT_OT_look_through(Telling, bpy.types.Operator):
+    """Look through this input camera: its picture lies over the splats, the render has its size"""
+
+    bl_idname = "gsopt.look_through"
+    bl_label = "Look Through"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    camera: bpy.props.StringProperty()  # type: ignore[valid-type]
+    step: bpy.props.IntProperty(default=0)  # type: ignore[valid-type]
+
+    def do(self, context: Any) -> str:
+        scene = context.scene
+        cameras = [o for o in scene.objects if o.type == "CAMERA" and "gsopt_size" in o]
+        named = scene.objects.get(self.camera) if self.camera else None
+        if not cameras or (self.camera and named not in cameras):
+            raise UsageError("There is no input camera of that name. Import the cameras first.")
+        at = cameras.index(scene.camera) + self.step if scene.camera in cameras else 0
+        camera = named or cameras[at % len(cameras)]
+        scene.camera = camera
+        width, height = picture_size(camera)
+        if width and height:
+            scene.render.resolution_x, scene.render.resolution_y = width, height
+            scene.render.resolution_percentage = 100
+            set_pixel_filter(scene, splat_object.pixel_filter(camera.data.angle, width))
+        for picture in camera.data.background_images:
+            picture.alpha = scene.gsopt.picture
+        for area in [a for w in context.window_manager.windows for a in w.screen.areas if a.type == "VIEW_3D"]:
+            area.spaces.active.region_3d.view_perspective = "CAMERA"
+        return camera.name
+
+
+def picture_size(camera: Any) -> tuple[int, int]:
+    """Of the input picture, px."""
+    width, height = camera["gsopt_size"]
+    pictures = [p.image for p in camera.data.background_images if p.image]
+    return (width, height) if width and height else tuple(pictures[0].size) if pictures else (0, 0)
+
+
+def set_pixel_filter(scene: Any, value: float) -> None:
+    for thing in scene.objects:
+        modifier = splat_object.modifier_of(thing) if splat_object.is_splats(thing) else None
+        if modifier is not None:
+            splat_object.set_input(modifier, "Pixel Filter", value)
+
+
+class GSOPT_OT_statistics(Telling, bpy.types.Operator):
+    """Count the splats and draw their histograms"""
+
+    bl_idname = "gsopt.statistics"
+    bl_label = "Statistics"
+
+    def do(self, context: Any) -> str:
+        mesh = active_splats(context).data
+        shown = splat_object.read_mesh(mesh).rows(~splat_object.hidden(mesh))
+        found = loading.SUMMARIES[mesh.name] = statistics.summary(shown)
+        return f"{found.count:,} splats, {found.outliers:,} outliers, SH degree {found.sh_degree}"
+
+
+class GSOPT_OT_filter(Telling, bpy.types.Operator):
+    """Hide the splats that do not pass; nothing is deleted"""
+
+    bl_idname = "gsopt.filter"
+    bl_label = "Hide What Fails"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def do(self, context: Any) -> str:
+        thing = active_splats(context)
+        splats = splat_object.read_mesh(thing.data)
+        kept = chosen_filter(context.scene.gsopt, thing).keeps(splats)
+        splat_object.hide(thing.data, ~kept)
+        loading.SUMMARIES[thing.data.name] = statistics.summary(splats.rows(kept))
+        return f"{int(kept.sum()):,} of {len(kept):,} splats pass"
+
+
+def chosen_filter(settings: Any, thing: Any) -> statistics.Filter:
+    """What the panel says, in the splats' own frame."""
+    inverse = thing.matrix_world.inverted_safe()
+    scale = inverse.to_scale().x
+    box = None
+    if settings.box is not None:
+        corners = np.array([tuple(corner) for corner in settings.box.bound_box])
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        unit = Matrix.Translation(0.5 * (low + high)) @ Matrix.Diagonal((*np.maximum(0.5 * (high - low), 1e-9), 1.0))
+        box = np.array((settings.box.matrix_world @ unit).inverted_safe() @ thing.matrix_world)
+    return statistics.Filter(
+        opacity=(settings.least_opacity, 1.0),
+        largest_scale=settings.largest_scale * scale or None,
+        farthest=settings.farthest * scale or None,
+        center=tuple(inverse @ settings.center.copy()) if settings.farthest else (0.0, 0.0, 0.0),
+        box_from_local=box,
+        without_outliers=settings.no_outliers,
+    )
+
+
+class GSOPT_OT_show_all(Telling, bpy.types.Operator):
+    """Show the hidden splats again"""
+
+    bl_idname = "gsopt.show_all"
+    bl_label = "Show All"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def do(self, context: Any) -> None:
+        mesh = active_splats(context).data
+        splat_object.hide(mesh, np.zeros(len(mesh.vertices), bool))
+        loading.SUMMARIES.pop(mesh.name, None)
+
+
+class GSOPT_OT_delete_hidden(Telling, bpy.types.Operator):
+    """Delete the hidden splats from the object; the file stays as it is"""
+
+    bl_idname = "gsopt.delete_hidden"
+    bl_label = "Delete Hidden"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def do(self, context: Any) -> str:
+        thing = active_splats(context)
+        gone = splat_object.hidden(thing.data)
+        if not gone.any():
+            raise UsageError("No splat is hidden. Set a filter and hide what fails first.")
+        kept = splat_object.read_mesh(thing.data).rows(~gone)
+        splat_object.replace_mesh(bpy, thing, splat_object.make_mesh(bpy, thing.data.name, kept))
+        loading.SUMMARIES[thing.data.name] = statistics.summary(kept)
+        return f"{int(gone.sum()):,} splats deleted, {len(kept):,} left"
+
+
+class GSOPT_OT_export(Telling, bpy.types.Operator):
+    """Write the splats that are not hidden to a PLY, in the axes of the file they came from"""
+
+    bl_idname = "gsopt.export"
+    bl_label = "Export PLY"
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
+    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        self.filepath = self.filepath or "splats.ply"
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def do(self, context: Any) -> str:
+        mesh = active_splats(context).data
+        splats = splat_object.read_mesh(mesh).rows(~splat_object.hidden(mesh))
+        path = absolute(self.filepath)
+        write_ply(path.with_suffix(".ply"), splats, comment="Generated by gsopt for Blender")
+        return f"{len(splats):,} splats in {path.with_suffix('.ply')}"
+
+
+CLASSES = (
+    GSOPT_OT_import_splats,
+    GSOPT_OT_import_cameras,
+    GSOPT_OT_look_through,
+    GSOPT_OT_statistics,
+    GSOPT_OT_filter,
+    GSOPT_OT_show_all,
+    GSOPT_OT_delete_hidden,
+    GSOPT_OT_export,
+)

@@ -1,0 +1,156 @@
+"""1 Source: a mesh becomes a dataset, photos get their poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from . import watching
+from .core import arguments, job
+from .core.errors import GsoptError, InputError, UsageError
+from .preferences import absolute, python, script, work_folder
+from .telling import Telling, Waiting
+
+LONG = 24 * 3600.0
+"""Seconds that an operator waits at most."""
+
+
+def settle(context: Any, operator: Any, work: job.Job) -> str:
+    """Follow a program; without a window until its end. GsoptError when it failed then."""
+    watching.started(context.scene, work)
+    if not operator.waits:
+        return "Started. The panel shows how far it is."
+    entry = getattr(context.scene.gsopt, f"job_{work.kind}")
+    watching.wait(context.scene, lambda: entry.state != "RUNNING", LONG)
+    if entry.state == "FAILED":
+        raise GsoptError(entry.message)
+    return "Done."
+
+
+def refuse_two(context: Any, kind: str) -> None:
+    if getattr(context.scene.gsopt, f"job_{kind}").state == "RUNNING":
+        raise UsageError("This work is going on already. Wait for it, or cancel it first.")
+
+
+class GSOPT_OT_test(Waiting, bpy.types.Operator):
+    """Ask the interpreter what it has: `gsopt doctor`"""
+
+    bl_idname = "gsopt.test"
+    bl_label = "Test"
+
+    def do(self, context: Any) -> str:
+        refuse_two(context, "doctor")
+        context.scene.gsopt.doctor = "asking ..."
+        folder = job.free_folder(work_folder(context) / "jobs", "doctor")
+        settle(context, self, job.start("doctor", arguments.doctor(python(context)), folder))
+        return str(context.scene.gsopt.doctor)
+
+
+class GSOPT_OT_render_dataset(Waiting, bpy.types.Operator):
+    """Render posed views of the selected objects, or of the collection, in a Blender of its own"""
+
+    bl_idname = "gsopt.render_dataset"
+    bl_label = "Render Dataset"
+
+    def do(self, context: Any) -> str:
+        refuse_two(context, "dataset")
+        settings, shapes = context.scene.gsopt, chosen_objects(context)
+        rendering = arguments.Rendering(
+            views=settings.render_views,
+            test_views=settings.render_test_views,
+            resolution=settings.render_size,
+            layout=settings.render_layout,
+            samples=settings.render_samples,
+            seed=settings.seed,
+            threads=settings.threads,
+        )
+        out = job.free_folder(work_folder(context) / "datasets", safe(settings.collection or shapes[0]))
+        folder = job.free_folder(work_folder(context) / "jobs", "dataset")
+        blender = bpy.app.binary_path
+        words = [blender, "" if blender else own_python(), script(context)]
+        mesh = write_shapes(folder, shapes)
+        call = arguments.render(str(words[0]), str(words[1]), Path(words[2]), mesh, out, rendering)
+        return settle(context, self, job.start("dataset", call, folder, out, rendering.total))
+
+
+def own_python() -> str:
+    """The Python that has bpy as a module, where there is no program Blender."""
+    import sys
+
+    return sys.executable
+
+
+def safe(thing: Any) -> str:
+    """A name as a folder: letters of every script stay."""
+    kept = "".join(c if c.isalnum() or c in "-_ " else "_" for c in thing.name).strip()
+    return kept[:60] or "object"
+
+
+def chosen_objects(context: Any) -> list[Any]:
+    """What is to be rendered. UsageError where there is nothing with a surface."""
+    collection = context.scene.gsopt.collection
+    among = collection.all_objects if collection else context.selected_objects
+    solids = ("MESH", "CURVE", "SURFACE", "FONT", "META")
+    found = [o for o in among if o.type in solids and not o.hide_render and not o.data.get("gsopt_splats")]
+    if not found:
+        raise UsageError("Nothing to render is selected. Select a mesh, or choose a collection.")
+    return found
+
+
+def write_shapes(folder: Path, shapes: list[Any]) -> Path:
+    """The objects with all that they use in a .blend of their own: modifiers and materials stay what they are."""
+    path = folder / "shapes.blend"
+    stage = bpy.data.scenes.new("gsopt stage")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for shape in shapes:
+            stage.collection.objects.link(shape)
+        bpy.data.libraries.write(str(path), {stage}, path_remap="ABSOLUTE", compress=False)
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"Cannot write {path}: {error}. Free some space or choose another work folder.") from error
+    finally:
+        bpy.data.scenes.remove(stage)
+    return path
+
+
+class GSOPT_OT_find_poses(Waiting, bpy.types.Operator):
+    """Find where the photos were taken from: `gsopt sfm`"""
+
+    bl_idname = "gsopt.find_poses"
+    bl_label = "Find Poses"
+
+    def do(self, context: Any) -> str:
+        refuse_two(context, "poses")
+        settings = context.scene.gsopt
+        if not settings.photos:
+            raise UsageError("No photos are chosen. Choose a folder of photos or a video.")
+        photos = absolute(settings.photos)
+        if not photos.exists():
+            raise InputError(f"There is nothing at {photos}. Choose a folder of photos or a video.")
+        out = job.free_folder(work_folder(context) / "datasets", f"{photos.stem or 'photos'}-posed")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        call = arguments.poses(python(context), photos, out, settings.seed, settings.threads)
+        folder = job.free_folder(work_folder(context) / "jobs", "poses")
+        return settle(context, self, job.start("poses", call, folder, out))
+
+
+class GSOPT_OT_cancel(Telling, bpy.types.Operator):
+    """End this work"""
+
+    bl_idname = "gsopt.cancel"
+    bl_label = "Cancel"
+
+    kind: bpy.props.StringProperty()  # type: ignore[valid-type]
+
+    def do(self, context: Any) -> str:
+        if self.kind not in watching.KINDS:
+            raise UsageError(f"There is no work called {self.kind!r:.40}. Name one of {', '.join(watching.KINDS)}.")
+        entry = getattr(context.scene.gsopt, f"job_{self.kind}")
+        job.end(job.read_job(Path(entry.folder)))
+        entry.state, entry.message = "NONE", "Cancelled."
+        return "Cancelled."
+
+
+CLASSES = (GSOPT_OT_test, GSOPT_OT_render_dataset, GSOPT_OT_find_poses, GSOPT_OT_cancel)

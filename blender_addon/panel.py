@@ -1,0 +1,358 @@
+"""The panel in the 3D view's sidebar: four sub-panels in the order of the work. Drawing reads, it never computes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from . import loading, splat_object
+from .preferences import lines_of
+
+CATEGORY = "gsopt"
+
+
+class GSOPT_UL_prompts(bpy.types.UIList):
+    """Text, weight, polarity and view of each prompt in a row."""
+
+    def draw_item(
+        self,
+        context: Any,
+        layout: Any,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+        index: int = 0,
+        flag: int = 0,
+    ) -> None:
+        row = layout.row(align=True)
+        row.prop(item, "text", text="", emboss=False, icon="ADD" if item.polarity == "positive" else "REMOVE")
+        side = row.row(align=True)
+        side.ui_units_x = 3
+        side.label(text=f"{item.weight:g} {item.view}")
+
+
+class GSOPT_UL_paths(bpy.types.UIList):
+    """Files or folders by their last name."""
+
+    def draw_item(
+        self,
+        context: Any,
+        layout: Any,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_property: str,
+        index: int = 0,
+        flag: int = 0,
+    ) -> None:
+        layout.label(text=Path(item.path).name, icon="FILE")
+
+
+class Sidebar:
+    """Where all panels stand."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = CATEGORY
+
+
+class GSOPT_PT_main(Sidebar, bpy.types.Panel):
+    bl_idname = "GSOPT_PT_main"
+    bl_label = "gsopt"
+
+    def draw(self, context: Any) -> None:
+        settings, layout = context.scene.gsopt, self.layout
+        if settings.message:
+            tell(layout, settings.message, "ERROR")
+        row = layout.row(align=True)
+        row.prop(settings, "folder", text="Work")
+        row.operator("gsopt.test", text="", icon="CHECKMARK")
+        if settings.doctor:
+            tell(layout, settings.doctor, "INFO")
+
+
+def tell(layout: Any, text: str, icon: str) -> None:
+    box = layout.box().column(align=True)
+    for place, line in enumerate(lines_of(text, 44)[:8]):
+        box.label(text=line, icon=icon if place == 0 else "BLANK1")
+
+
+def show_job(layout: Any, entry: Any, kind: str) -> bool:
+    """How far a program is, or why it failed; whether it is going on."""
+    if entry.state == "RUNNING":
+        row = layout.row(align=True)
+        row.progress(factor=entry.share, text=entry.message[:60] or "working ...")
+        if kind != "import":
+            row.operator("gsopt.cancel", text="", icon="CANCEL").kind = kind
+        return True
+    if entry.state == "FAILED" and entry.message:
+        tell(layout, entry.message, "ERROR")
+    return False
+
+
+class Child(Sidebar):
+    bl_parent_id = "GSOPT_PT_main"
+
+
+class GSOPT_PT_source(Child, bpy.types.Panel):
+    bl_idname = "GSOPT_PT_source"
+    bl_label = "1  Source"
+
+    def draw(self, context: Any) -> None:
+        settings, layout = context.scene.gsopt, self.layout
+        layout.row().prop(settings, "source", expand=True)
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        if settings.source == "MESH":
+            column.prop(settings, "collection")
+            for name in ("render_views", "render_test_views", "render_size", "render_samples", "render_layout"):
+                column.prop(settings, name)
+            if not show_job(layout, settings.job_dataset, "dataset"):
+                layout.operator("gsopt.render_dataset", icon="RENDER_STILL")
+        elif settings.source == "PHOTOS":
+            column.prop(settings, "photos")
+            if not show_job(layout, settings.job_poses, "poses"):
+                layout.operator("gsopt.find_poses", icon="CAMERA_DATA")
+        else:
+            column.prop(settings, "dataset")
+
+
+class GSOPT_PT_guidance(Child, bpy.types.Panel):
+    bl_idname = "GSOPT_PT_guidance"
+    bl_label = "2  Guidance"
+
+    def draw(self, context: Any) -> None:
+        settings, layout = context.scene.gsopt, self.layout
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "domain")
+        if settings.domain == "own":
+            column.prop(settings, "template")
+        column.prop(settings, "notes")
+        if not show_job(layout, settings.job_prompts, "prompts"):
+            layout.operator("gsopt.propose", icon="OUTLINER_OB_FONT")
+        if len(settings.proposals):
+            draw_proposal(layout, settings)
+        draw_prompts(layout, settings)
+        draw_references(layout, settings)
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "prior")
+        if settings.prior == "FOLDER":
+            column.prop(settings, "prior_folder")
+        if settings.prior not in ("off", "auto"):
+            column.prop(settings, "lambda_sds")
+        if settings.prior != "off":
+            column.prop(settings, "front_view")
+            column.prop(settings, "device")
+
+
+def draw_proposal(layout: Any, settings: Any) -> None:
+    """The first proposal, to be accepted, edited or rejected."""
+    box, entry = layout.box(), settings.proposals[0]
+    box.label(text=f"{len(settings.proposals)} proposals, by {entry.source}")
+    box.prop(entry, "text", text="")
+    row = box.row(align=True)
+    for name in ("weight", "view", "polarity"):
+        row.prop(entry, name, text="")
+    for line in lines_of(f"{entry.rationale} {score_text(entry.score)}", 44)[:4]:
+        box.label(text=line)
+    row = box.row(align=True)
+    row.operator("gsopt.proposal", text="Accept", icon="CHECKMARK").accept = True
+    row.operator("gsopt.proposal", text="Reject", icon="X").accept = False
+    every = row.operator("gsopt.proposal", text="Accept All")
+    every.accept, every.all = True, True
+
+
+def score_text(score: float) -> str:
+    """Only where somebody measured it."""
+    return f"Alignment with the views {score:.2f}" if score >= -1 else ""
+
+
+def draw_prompts(layout: Any, settings: Any) -> None:
+    row = layout.row()
+    row.template_list("GSOPT_UL_prompts", "", settings, "prompts", settings, "prompt_index", rows=3)
+    side = row.column(align=True)
+    side.operator("gsopt.prompt_add", text="", icon="ADD")
+    side.operator("gsopt.prompt_remove", text="", icon="REMOVE")
+    side.separator()
+    side.operator("gsopt.prompts_read", text="", icon="IMPORT")
+    side.operator("gsopt.prompts_write", text="", icon="EXPORT")
+    if 0 <= settings.prompt_index < len(settings.prompts):
+        entry, row = settings.prompts[settings.prompt_index], layout.row(align=True)
+        for name in ("weight", "view", "polarity"):
+            row.prop(entry, name, text="")
+
+
+def draw_references(layout: Any, settings: Any) -> None:
+    row = layout.row()
+    row.template_list(
+        "GSOPT_UL_paths", "references", settings, "references", settings, "reference_index", rows=1, maxrows=4
+    )
+    side = row.column(align=True)
+    side.operator("gsopt.reference_add", text="", icon="ADD")
+    side.operator("gsopt.reference_remove", text="", icon="REMOVE")
+
+
+class GSOPT_PT_run(Child, bpy.types.Panel):
+    bl_idname = "GSOPT_PT_run"
+    bl_label = "3  Run"
+
+    def draw(self, context: Any) -> None:
+        settings, layout = context.scene.gsopt, self.layout
+        layout.row().prop(settings, "preset", expand=True)
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        if settings.preset == "OWN":
+            for name in ("iterations", "downscale", "strategy", "background", "hold_out"):
+                column.prop(settings, name)
+        for name in ("budget", "views", "threads", "live"):
+            column.prop(settings, name)
+        if settings.run_status in ("waiting", "running"):
+            draw_progress(layout, settings)
+        else:
+            layout.operator("gsopt.launch", icon="PLAY")
+            draw_outcome(layout, settings)
+        draw_runs(layout, settings)
+
+
+def draw_progress(layout: Any, settings: Any) -> None:
+    share = settings.run_step / settings.run_total if settings.run_total else 0.0
+    said = f"{settings.run_step:,} of {settings.run_total:,}" if settings.run_total else "reading the data ..."
+    layout.progress(factor=min(1.0, share), text=said)
+    row = layout.row()
+    row.label(text=f"PSNR {settings.run_psnr:.2f} dB" if settings.run_psnr >= 0 else "PSNR -")
+    row.label(text=f"{clock(settings.run_eta)} left" if settings.run_eta >= 0 else "")
+    layout.label(text=f"{settings.run_count:,} Gaussians")
+    if settings.run_message:
+        tell(layout, settings.run_message, "INFO")
+    row = layout.row(align=True)
+    row.operator("gsopt.stop", icon="PAUSE").kill = False
+    row.operator("gsopt.stop", text="End at Once", icon="CANCEL").kill = True
+    row.operator("gsopt.log", text="", icon="TEXT")
+
+
+def draw_outcome(layout: Any, settings: Any) -> None:
+    if not settings.run_status:
+        return
+    box = layout.box()
+    box.label(text=f"{Path(settings.run_path).name}: {settings.run_status}")
+    if settings.run_step:
+        box.label(text=f"step {settings.run_step:,}, {settings.run_count:,} Gaussians")
+    for line in lines_of(settings.run_message, 44)[:6]:
+        box.label(text=line)
+    row = box.row(align=True)
+    row.operator("gsopt.import_splats", text="Import", icon="IMPORT").from_run = True
+    if settings.run_status in ("stopped", "killed", "error"):
+        row.operator("gsopt.resume", icon="PLAY")
+    row.operator("gsopt.log", text="", icon="TEXT")
+
+
+def draw_runs(layout: Any, settings: Any) -> None:
+    row = layout.row(align=True)
+    row.label(text="Earlier runs")
+    row.operator("gsopt.list_runs", text="", icon="FILE_REFRESH")
+    row.operator("gsopt.attach", text="", icon="FILE_FOLDER")
+    if not len(settings.runs):
+        return
+    layout.template_list("GSOPT_UL_paths", "runs", settings, "runs", settings, "runs_index", rows=2)
+    if 0 <= settings.runs_index < len(settings.runs):
+        row = layout.row(align=True)
+        path = settings.runs[settings.runs_index].path
+        row.operator("gsopt.attach", text="Attach").directory = path
+        row.operator("gsopt.import_splats", text="Import").filepath = path
+
+
+def clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02}"
+
+
+class GSOPT_PT_inspect(Child, bpy.types.Panel):
+    bl_idname = "GSOPT_PT_inspect"
+    bl_label = "4  Inspect"
+
+    def draw(self, context: Any) -> None:
+        settings, layout = context.scene.gsopt, self.layout
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        for name in ("display", "most_shown", "up"):
+            column.prop(settings, name)
+        if not show_job(layout, settings.job_import, "import"):
+            layout.operator("gsopt.import_splats", icon="IMPORT")
+        row = layout.row(align=True)
+        row.operator("gsopt.import_cameras", text="Cameras", icon="OUTLINER_OB_CAMERA")
+        row.operator("gsopt.look_through", text="", icon="TRIA_LEFT").step = -1
+        row.operator("gsopt.look_through", text="", icon="TRIA_RIGHT").step = 1
+        row.prop(settings, "picture", text="Picture", slider=True)
+        active = context.view_layer.objects.active
+        if splat_object.is_splats(active):
+            draw_display(layout, active)
+            draw_summary(layout, active)
+            draw_filters(layout, settings)
+
+
+def draw_display(layout: Any, thing: Any) -> None:
+    box = layout.box()
+    box.label(text=thing.name, icon="POINTCLOUD_DATA")
+    column = box.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    for name in ("display", "size", "extent", "least_opacity", "most_shown", "color_by_view", "linear_color"):
+        column.prop(thing.gsopt, name)
+
+
+def draw_summary(layout: Any, thing: Any) -> None:
+    box = layout.box()
+    box.operator("gsopt.statistics", icon="FILE_REFRESH")
+    found = loading.SUMMARIES.get(thing.data.name)
+    if found is None or not found.count:
+        return
+    box.label(text=f"{found.count:,} splats, {found.outliers:,} outliers, SH {found.sh_degree}")
+    row = box.row()
+    for title, bars in (("Opacity", found.opacities), ("Size", found.sizes)):
+        column = row.column(align=True)
+        column.scale_y = 0.6
+        column.label(text=title)
+        most = max(bar.count for bar in bars)
+        for bar in bars:
+            column.progress(factor=bar.count / most, text=f"{bar.low:.2g} - {bar.high:.2g}: {bar.count:,}")
+
+
+def draw_filters(layout: Any, settings: Any) -> None:
+    box = layout.box()
+    column = box.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    for name in ("least_opacity", "largest_scale", "farthest"):
+        column.prop(settings, name)
+    if settings.farthest:
+        column.prop(settings, "center")
+    column.prop(settings, "box")
+    column.prop(settings, "no_outliers")
+    row = box.row(align=True)
+    row.operator("gsopt.filter", text="Hide")
+    row.operator("gsopt.show_all")
+    row.operator("gsopt.delete_hidden", text="Delete")
+    box.operator("gsopt.export", icon="EXPORT")
+
+
+CLASSES = (
+    GSOPT_UL_prompts,
+    GSOPT_UL_paths,
+    GSOPT_PT_main,
+    GSOPT_PT_source,
+    GSOPT_PT_guidance,
+    GSOPT_PT_run,
+    GSOPT_PT_inspect,
+)

@@ -1,0 +1,93 @@
+"""What belongs to the machine, not to the scene: the interpreter, where work is put, the language model's address."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import bpy
+from bpy.props import StringProperty
+
+from .core import interpreter
+
+DEFAULTS = SimpleNamespace(interpreter="", checkout="", folder="", llm="", model="")
+
+
+class GsoptPreferences(bpy.types.AddonPreferences):
+    """Set once."""
+
+    bl_idname = __package__
+
+    interpreter: StringProperty(  # type: ignore[valid-type]
+        name="Interpreter",
+        description="Python in which gsopt is installed; empty: found near the file, the project and on PATH",
+        subtype="FILE_PATH",
+    )
+    checkout: StringProperty(  # type: ignore[valid-type]
+        name="Source Folder",
+        description="Folder of gsopt's sources with scripts/synth_views.py; empty: found above the interpreter",
+        subtype="DIR_PATH",
+    )
+    folder: StringProperty(  # type: ignore[valid-type]
+        name="Work Folder",
+        description="Where datasets, runs and logs go; empty: `gsopt` beside the saved file, else in the home folder",
+        subtype="DIR_PATH",
+    )
+    llm: StringProperty(  # type: ignore[valid-type]
+        name="Language Model",
+        description="Address of an OpenAI-compatible server that writes prompts; empty: templates write them",
+    )
+    model: StringProperty(name="Model", description="Its name on that server")  # type: ignore[valid-type]
+
+    def draw(self, context: Any) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        for name in ("interpreter", "checkout", "folder", "llm", "model"):
+            layout.prop(self, name)
+        layout.operator("gsopt.test", icon="CHECKMARK")
+        for line in lines_of(context.scene.gsopt.doctor):
+            layout.label(text=line)
+
+
+def lines_of(text: str, width: int = 90) -> list[str]:
+    """A text in lines that fit."""
+    lines = [""]
+    for word in text.split():
+        if len(lines[-1]) + len(word) > width:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return [line for line in lines if line]
+
+
+def preferences(context: Any) -> Any:
+    """The preferences, or their defaults where the extension runs without being enabled."""
+    entry = context.preferences.addons.get(__package__)
+    return DEFAULTS if entry is None or entry.preferences is None else entry.preferences
+
+
+def absolute(path: str) -> Path:
+    """A path as the interface has it, `//` being the folder of the file."""
+    return Path(os.path.abspath(bpy.path.abspath(path)))
+
+
+def work_folder(context: Any) -> Path:
+    """Where datasets, runs and logs go."""
+    chosen = context.scene.gsopt.folder or preferences(context).folder
+    if chosen:
+        return absolute(chosen)
+    return absolute("//gsopt") if bpy.data.filepath else Path.home() / "gsopt"
+
+
+def python(context: Any) -> Path:
+    """The interpreter with gsopt. UsageError, with what to do, where there is none."""
+    near = [Path(__file__).resolve().parent, Path.cwd()]
+    if bpy.data.filepath:
+        near.insert(0, Path(bpy.data.filepath).parent)
+    return interpreter.find(preferences(context).interpreter, near, os.environ)
+
+
+def script(context: Any) -> Path:
+    """scripts/synth_views.py of the sources."""
+    return interpreter.checkout(python(context), preferences(context).checkout) / interpreter.SCRIPT

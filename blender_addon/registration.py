@@ -1,0 +1,70 @@
+"""Everything that Blender must know about, and must forget again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from . import (
+    operators_guidance,
+    operators_inspect,
+    operators_run,
+    operators_source,
+    panel,
+    preferences,
+    properties,
+    watching,
+)
+
+CLASSES = (
+    preferences.GsoptPreferences,
+    *properties.CLASSES,
+    *operators_source.CLASSES,
+    *operators_guidance.CLASSES,
+    *operators_run.CLASSES,
+    *operators_inspect.CLASSES,
+    *panel.CLASSES,
+)
+
+
+@persistent
+def after_load(*_: Any) -> None:
+    """A file was opened: whatever it left running is followed again."""
+    watching.forget()
+    watching.watch()
+
+
+def menu(self: Any, context: Any) -> None:
+    self.layout.operator("gsopt.import_splats", text="Gaussian Splats (.ply, .spz)")
+
+
+def export_menu(self: Any, context: Any) -> None:
+    self.layout.operator("gsopt.export", text="Gaussian Splats (.ply)")
+
+
+def register() -> None:
+    for kind in CLASSES:
+        bpy.utils.register_class(kind)
+    bpy.types.Scene.gsopt = bpy.props.PointerProperty(type=properties.GsoptScene)
+    bpy.types.Object.gsopt = bpy.props.PointerProperty(type=properties.GsoptObject)
+    bpy.types.TOPBAR_MT_file_import.append(menu)
+    bpy.types.TOPBAR_MT_file_export.append(export_menu)
+    bpy.app.handlers.load_post.append(after_load)
+    if not bpy.app.background:
+        bpy.app.timers.register(after_load, first_interval=0.1)  # the file that is open when it is enabled
+
+
+def unregister() -> None:
+    if bpy.app.timers.is_registered(after_load):
+        bpy.app.timers.unregister(after_load)
+    watching.forget()
+    if after_load in bpy.app.handlers.load_post:
+        bpy.app.handlers.load_post.remove(after_load)
+    bpy.types.TOPBAR_MT_file_export.remove(export_menu)
+    bpy.types.TOPBAR_MT_file_import.remove(menu)
+    del bpy.types.Object.gsopt
+    del bpy.types.Scene.gsopt
+    for kind in reversed(CLASSES):
+        bpy.utils.unregister_class(kind)

@@ -1,0 +1,41 @@
+"""Operators that end in a message: whatever a person can mend is reported and stays in the panel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from .core.errors import GsoptError
+
+
+class Telling:
+    """Mixed into operators; they implement `do`, which may raise a GsoptError."""
+
+    bl_options = {"REGISTER"}  # noqa: RUF012  Blender's way
+
+    def execute(self, context: Any) -> set[str]:
+        context.scene.gsopt.message = ""
+        try:
+            said = self.do(context)  # type: ignore[attr-defined]
+        except GsoptError as error:
+            context.scene.gsopt.message = str(error)
+            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            return {"CANCELLED"}
+        if isinstance(said, str):
+            self.report({"INFO"}, said)  # type: ignore[attr-defined]
+        return {"FINISHED"}
+
+
+class Waiting(Telling):
+    """Operators that start something: without a window they wait for its end, as scripts expect."""
+
+    wait: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Wait", description="Return only when it is over; always so without a window", options={"SKIP_SAVE"}
+    )
+
+    @property
+    def waits(self) -> bool:
+        if self.properties.is_property_set("wait"):  # type: ignore[attr-defined]
+            return bool(self.wait)
+        return bool(bpy.app.background)

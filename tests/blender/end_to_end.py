@@ -1,0 +1,126 @@
+"""The whole way in one Blender without a window: mesh, dataset, prompts, run, stop, re-attach, import, filter, export.
+
+    blender -b --factory-startup -P tests/blender/end_to_end.py -- WORK [MESH]
+    python tests/blender/end_to_end.py -- WORK [MESH]          (a Python with the module bpy)
+
+Prints what it found as one line of JSON, beginning with `found `. Every step is an operator of the panel.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import bpy  # noqa: E402
+
+import blender_addon  # noqa: E402
+
+VIEWS, TEST_VIEWS, SIZE = 6, 2, 48
+
+
+def call(operator: Any, **settings: Any) -> None:
+    assert operator(**settings) == {"FINISHED"}, operator
+
+
+def bring_mesh(path: Path | None) -> None:
+    """The mesh, or Blender's monkey, selected."""
+    for other in list(bpy.data.objects):
+        bpy.data.objects.remove(other)
+    if path is None:
+        bpy.ops.mesh.primitive_monkey_add(location=(3, -2, 1))
+    elif path.suffix == ".obj":
+        bpy.ops.wm.obj_import(filepath=str(path))
+    else:
+        bpy.ops.import_scene.gltf(filepath=str(path))
+    bpy.ops.object.select_all(action="SELECT")
+
+
+def prepare(work: Path) -> Any:
+    settings = bpy.context.scene.gsopt
+    settings.folder = str(work)
+    settings.render_views, settings.render_test_views = VIEWS, TEST_VIEWS
+    settings.render_size, settings.render_samples = SIZE, 2
+    settings.threads, settings.prior = 1, "off"
+    settings.preset, settings.iterations = "OWN", 4000
+    return settings
+
+
+def write_prompts(settings: Any, work: Path) -> list[str]:
+    call(bpy.ops.gsopt.prompt_add, text="a small carved figure, 春")
+    call(bpy.ops.gsopt.prompt_add, text="blurry", polarity="negative")
+    call(bpy.ops.gsopt.prompts_write, filepath=str(work / "prompts.json"))
+    settings.prompts.clear()
+    call(bpy.ops.gsopt.prompts_read, filepath=str(work / "prompts.json"))
+    return [entry.text for entry in settings.prompts]
+
+
+def run_and_stop(found: dict[str, Any]) -> None:
+    """Launch, see events come, save and open the file again in the middle, stop, go on, stop."""
+    settings = bpy.context.scene.gsopt
+    call(bpy.ops.gsopt.launch, wait=False)
+    call(bpy.ops.gsopt.follow, step=20, seconds=1800.0)
+    found["seen running"] = [settings.run_status, settings.run_step, settings.run_total, settings.run_count]
+    path = str(Path(settings.folder) / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    settings = bpy.context.scene.gsopt
+    call(bpy.ops.gsopt.follow, step=settings.run_step + 5, seconds=1800.0)
+    found["re-attached"] = [settings.run_status, settings.run_step]
+    call(bpy.ops.gsopt.stop)
+    found["stopped"] = [settings.run_status, settings.run_step]
+    settings.run_status = ""
+    call(bpy.ops.gsopt.list_runs)
+    call(bpy.ops.gsopt.attach, directory=settings.runs[0].path)
+    found["attached"] = settings.run_status
+    call(bpy.ops.gsopt.resume, wait=False)
+    call(bpy.ops.gsopt.follow, step=settings.run_step + 30, seconds=1800.0)
+    found["resumed"] = [settings.run_status, settings.run_step]
+    call(bpy.ops.gsopt.stop)
+
+
+def inspect(found: dict[str, Any], work: Path) -> None:
+    settings = bpy.context.scene.gsopt
+    call(bpy.ops.gsopt.import_splats, from_run=True)
+    thing = bpy.context.view_layer.objects.active
+    found["imported"] = len(thing.data.vertices)
+    found["place"] = [round(value, 3) for value in thing.matrix_world.translation]
+    call(bpy.ops.gsopt.import_cameras)
+    call(bpy.ops.gsopt.look_through)
+    found["cameras"] = sum(o.type == "CAMERA" for o in bpy.context.scene.objects)
+    settings.least_opacity = 0.2
+    call(bpy.ops.gsopt.filter)
+    call(bpy.ops.gsopt.delete_hidden)
+    found["kept"] = len(thing.data.vertices)
+    call(bpy.ops.gsopt.export, filepath=str(work / "edited splats.ply"))
+    bpy.ops.wm.save_mainfile()
+
+
+def main(work: Path, mesh: Path | None) -> None:
+    bpy.ops.wm.read_factory_settings(use_empty=False)
+    blender_addon.register()
+    bring_mesh(mesh)
+    settings, began = prepare(work), time.time()
+    found: dict[str, Any] = {"blender": bpy.app.version_string}
+    call(bpy.ops.gsopt.test)
+    found["doctor"] = settings.doctor
+    call(bpy.ops.gsopt.render_dataset)
+    found["dataset"] = settings.job_dataset.message
+    found["prompts"] = write_prompts(settings, work)
+    run_and_stop(found)
+    inspect(found, work)
+    blender_addon.unregister()
+    found["left behind"] = [name for name in ("Scene", "Object") if hasattr(getattr(bpy.types, name), "gsopt")]
+    found["seconds"] = round(time.time() - began, 1)
+    print("found " + json.dumps(found), flush=True)
+
+
+if __name__ == "__main__":
+    words = sys.argv[sys.argv.index("--") + 1 :]
+    main(Path(words[0]).absolute(), Path(words[1]).absolute() if len(words) > 1 else None)
