@@ -1,4 +1,4 @@
-"""Three sets of settings, chosen by measurement (docs/performance.md, "Presets"). Any flag that is given wins."""
+"""Three sets of settings for little, some and much time (docs/performance.md). Any flag that is given wins."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class Flags:
     resume: bool = False
     """Continue the run in that folder from its newest checkpoint, with the same result as if it had never stopped."""
     preset: Preset = "default"
-    """draft: a look in a tenth of the time; high: about half a dB more for twice the time. Other flags win over it."""
+    """draft: 2000 steps with more skips; default: 7000 steps; high: 15,000 steps. Other flags win over it."""
     iterations: int = 7000
     """Training steps."""
     views: Annotated[int | None, arg(metavar="N")] = None
