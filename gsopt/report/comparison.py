@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -14,6 +15,8 @@ from gsopt.report.page import POLICY
 from gsopt.report.pictures import data_uri
 
 NOTHING = "\N{EN DASH}"
+CLEAR = 0.05
+"""dB by which a set of prompts has to lead to be called the best."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,9 @@ def comparison_page(
 
 
 def _table(views: Sequence[str], columns: Sequence[Column]) -> str:
-    best = max(column.mean for column in columns)
-    head = "".join(f"<th>{escape(view)}</th>" for view in views)
+    means = sorted((column.mean for column in columns), reverse=True)
+    best = means[0] if len(means) == 1 or means[0] - means[1] >= CLEAR else math.inf
+    head = "".join(f"<th>{escape(view)}</th>" for view in (f"to {columns[0].name}", *views))
     rows = []
     for column in columns:
         badge = ' <span class="badge best">best</span>' if column.mean == best else ""
@@ -65,7 +69,7 @@ def _table(views: Sequence[str], columns: Sequence[Column]) -> str:
         )
     return (
         '<section><h2>PSNR of views that were left out <span class="muted">dB, higher is better</span></h2>'
-        f'<div class="scroll"><table><thead><tr><th>prompts</th><th>mean</th><th>to the first</th>{head}'
+        f'<div class="scroll"><table><thead><tr><th>prompts</th><th>mean</th>{head}'
         f"<th>CLIP alignment</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div></section>\n"
     )
 
@@ -86,7 +90,9 @@ def _pictures(views: Sequence[str], truths: Sequence[Image.Image], columns: Sequ
 def _words(columns: Sequence[Column]) -> str:
     lists = []
     for column in columns:
+        if not column.prompts:
+            continue
         rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(text)}</td></tr>" for what, text in column.prompts)
-        table = f'<table class="settings"><tbody>{rows}</tbody></table>' if rows else '<p class="muted">No prompts.</p>'
+        table = f'<table class="settings"><tbody>{rows}</tbody></table>'
         lists.append(f"<details open><summary>{escape(column.name)}</summary>{table}</details>")
     return f"<section><h2>Words</h2>{''.join(lists)}</section>\n"
