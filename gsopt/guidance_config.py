@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from gsopt import check
@@ -21,9 +21,10 @@ class GuidanceConfig:
     prior `auto` stands for is at hand, else 0, and the run says which and why."""
     prior: str = "auto"
     """auto (the embedded prior), embedded, sd21, a diffusers folder, or a model id of the Hugging Face hub."""
-    policy: Literal["sds", "recon", "sdi"] = "sds"
-    """sds: one noisy look per step (Poole et al. 2022); recon: a denoised target, cached and refreshed (Zhou & Tulsiani
-    2023); sdi: the noise is found by DDIM inversion (Lukoianov et al. 2024)."""
+    policy: Literal["auto", "sds", "recon", "sdi"] = "auto"
+    """auto: what suits the prior, recon for a view-conditioned one, sds for text-to-image. sds: one noisy look per step
+    (Poole et al. 2022); recon: a denoised target, cached and refreshed (Zhou & Tulsiani 2023); sdi: the noise is found
+    by DDIM inversion (Lukoianov et al. 2024)."""
     prompt: tuple[str, ...] = ()
     """What the object is, in the expert's words; one prompt per flag."""
     negative: tuple[str, ...] = ()
@@ -38,8 +39,9 @@ class GuidanceConfig:
     """Folder or hub id of a CLIP model for image embeddings and alignment scores, where the prior has none."""
     image_weight: float = 0.5
     """Length of the appended image tokens relative to the text tokens; 0 leaves them out."""
-    guidance_scale: float = 3.0
-    """Classifier-free guidance (Ho & Salimans 2022); 1 asks the model once, without the negative prompts."""
+    guidance_scale: float | None = None
+    """Classifier-free guidance (Ho & Salimans 2022); 1 asks the model once, without the negative prompts. When not
+    given: 3 for a text-to-image prior, 1 for a view-conditioned one."""
     rescale: float = 0.5
     """How far the guided estimate is brought back to the contrast of the conditional one (Lin et al. 2024), 0 to 1."""
     weighting: Literal["sigma2", "fantasia", "one", "x0"] = "sigma2"
@@ -57,17 +59,18 @@ class GuidanceConfig:
     """Share of the run before the first guided step."""
     stop: float = 0.95
     """Share of the run after which no step is guided."""
-    every: int = 10
-    """Steps between two guided ones."""
+    every: int | None = None
+    """Steps between two guided ones. When not given: 2 with recon, whose targets last; else 10."""
     min_uncertainty: float = 0.05
     """Mean uncertainty of a view below which it is not guided: the input views decide there."""
     geometry: float = 1.0
     """Factor on the guidance gradient of positions, rotations, scales and opacities; 0 guides colors only."""
     clip_rms: float = 1.0
     """Largest root mean square of the guidance gradient before the weights; 0 = any."""
-    denoise_steps: int = 5
-    """recon: DDIM steps from the noisy render to the target."""
-    refresh_every: int = 500
+    denoise_steps: int | None = None
+    """recon: DDIM steps from the noisy render to the target. When not given: 5 for a text-to-image prior; 1 for a
+    view-conditioned one, which is trained to repair a render at once."""
+    refresh_every: int = 300
     """recon: steps after which a cached target is made again."""
     inversion_steps: int = 5
     """sdi: DDIM steps from the render to its noise."""
@@ -93,29 +96,44 @@ class GuidanceConfig:
             check.within("--lambda_sds", self.lambda_sds, 0.0, MOST, "0 turns guidance off; 0.2 is a sound start.")
         if not self.prior:
             raise UsageError("`--prior` is empty. Give embedded, sd21, a diffusers folder or a hub id.")
-        check.one_of("--guidance.policy", self.policy, ("sds", "recon", "sdi"))
+        check.one_of("--guidance.policy", self.policy, ("auto", "sds", "recon", "sdi"))
         check.one_of("--guidance.weighting", self.weighting, ("sigma2", "fantasia", "one", "x0"))
         check.one_of("--guidance.anneal", self.anneal, ("sqrt", "linear"))
         check.one_of("--guidance.dtype", self.dtype, ("auto", "float32", "bfloat16", "float16"))
         check.one_of("--guidance.device", self.device, ("auto", "cpu", "cuda"))
         check.at_least("--guidance.front-view", self.front_view or 0, 0, "Input views count from 0.")
         check.within("--guidance.image-weight", self.image_weight, 0.0, 10.0, "0 leaves image tokens out.")
-        check.within("--guidance.guidance-scale", self.guidance_scale, 0.0, 1000.0, "1 to 10 is usual here.")
+        if self.guidance_scale is not None:
+            check.within("--guidance.guidance-scale", self.guidance_scale, 0.0, 1000.0, "1 to 10 is usual here.")
         check.within("--guidance.rescale", self.rescale, 0.0, 1.0, "0 leaves the contrast alone.")
         check.within("--guidance.t-min", self.t_min, 0.001, 0.98, "The default is 0.02.")
         check.within("--guidance.t-max", self.t_max, self.t_min, 0.98, "It must not lie below t-min.")
         check.within("--guidance.t-max-end", self.t_max_end, self.t_min, 0.98, "It must not lie below t-min.")
         check.within("--guidance.start", self.start, 0.0, 1.0, "It is a share of the run; the default is 0.25.")
         check.within("--guidance.stop", self.stop, self.start, 1.0, "It must not lie before the start.")
-        check.at_least("--guidance.every", self.every, 1, "1 guides every step; the default is 10.")
+        if self.every is not None:
+            check.at_least("--guidance.every", self.every, 1, "1 guides every step.")
         check.within("--guidance.min-uncertainty", self.min_uncertainty, 0.0, 1.0, "0 guides every view.")
         check.within("--guidance.geometry", self.geometry, 0.0, MOST, "0 guides colors only.")
         check.within("--guidance.clip-rms", self.clip_rms, 0.0, MOST, "0 lets any gradient pass.")
-        check.within("--guidance.denoise-steps", self.denoise_steps, 1, 1000, "The default is 5.")
-        check.at_least("--guidance.refresh-every", self.refresh_every, 1, "The default is 500.")
+        if self.denoise_steps is not None:
+            check.within("--guidance.denoise-steps", self.denoise_steps, 1, 1000, "1 to 5 is usual.")
+        check.at_least("--guidance.refresh-every", self.refresh_every, 1, "The default is 300.")
         check.within("--guidance.inversion-steps", self.inversion_steps, 1, 1000, "The default is 5.")
         check.within("--guidance.references", self.references, 0, 64, "The default is 4.")
         check.within("--guidance.guard-views", self.guard_views, 0, 16, "0 makes no check; the default is 2.")
         check.at_least("--guidance.guard-steps", self.guard_steps, 2, "The default is 240.")
         if self.size:
             check.within("--guidance.size", self.size, 8, 4096, "0 takes what the prior was made for.")
+
+
+def settled(config: GuidanceConfig, view_conditioned: bool) -> GuidanceConfig:
+    """The same with what was left to gsopt decided, for a prior of that kind."""
+    policy = config.policy if config.policy != "auto" else "recon" if view_conditioned else "sds"
+    usual = {
+        "guidance_scale": 1.0 if view_conditioned else 3.0,
+        "every": 2 if policy == "recon" else 10,
+        "denoise_steps": 1 if view_conditioned else 5,
+    }
+    open_ones = {name: value for name, value in usual.items() if getattr(config, name) is None}
+    return replace(config, policy=policy, **open_ones)

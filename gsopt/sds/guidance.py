@@ -14,7 +14,7 @@ from gsopt.cameras import Cameras
 from gsopt.data.scene import Scene
 from gsopt.errors import NumericalError
 from gsopt.gaussians import Gaussians
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.guidance_config import GuidanceConfig, settled
 from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.sds import coverage, policies, schedule
@@ -109,7 +109,11 @@ class Guide:
     ) -> None:
         """`weight` is lambda after the guard; `front` the camera whose side is the front; `background` None draws a
         color per step, as the training does."""
-        self.prior, self.conditioning, self.config, self.backend = prior, conditioning, config, backend
+        self.prior, self.conditioning, self.backend = prior, conditioning, backend
+        self.config = settled(config, prior.aligned)
+        assert self.config.denoise_steps is not None
+        assert self.config.guidance_scale is not None
+        self._denoise_steps, self._guidance_scale = self.config.denoise_steps, self.config.guidance_scale
         self.weight, self.iterations, self.seed, self.background = weight, iterations, seed, background
         self.warn = warn
         self.inputs = [view.camera for view in scene.train]
@@ -195,9 +199,8 @@ class Guide:
         images, weights = seen.images, seen.weights
         if self.config.policy == "recon":
             target = self._target(step, index, seen)
-            g = policies.pixel_pull(images, target)
             self._remember(step, index, "", images, weights, None, target[0])
-            return 2 * weights * g / g.numel()  # z = 2x - 1
+            return policies.pixel_pull(images, target, weights)
         with torch.enable_grad():
             leaf = images.clone().requires_grad_()
             z = self.prior.encode(leaf)
@@ -218,7 +221,7 @@ class Guide:
             with torch.no_grad():
                 z = self.prior.encode(seen.images)
                 _, look = self._look(step, index, seen, z)
-                target = self.prior.decode(policies.denoised(self.prior, z, look, self.config.denoise_steps))
+                target = self.prior.decode(policies.denoised(self.prior, z, look, self._denoise_steps))
             if not bool(torch.isfinite(target).all()):
                 raise NumericalError(
                     f"The decoded target of step {step} is not finite. Choose --guidance.dtype float32."
@@ -248,7 +251,7 @@ class Guide:
             t=self.prior.schedule.step(share),
             eps=torch.randn(z.shape, generator=random).to(z),
             pair=Pair(positive, negative),
-            scale=Scale(self.config.guidance_scale, self.config.rescale, self.config.sequential),
+            scale=Scale(self._guidance_scale, self.config.rescale, self.config.sequential),
             weighting=self.config.weighting,
             clip_rms=self.config.clip_rms,
         )

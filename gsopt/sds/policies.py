@@ -7,7 +7,11 @@ the resolution. g depends on the policy:
 
     sds    g = w(t) (eps_hat - eps) = w(t) sqrt(a/(1-a)) (z - x0_hat)                (Poole et al. 2022, eq. 3)
     sdi    the same, with the noise that DDIM inversion finds for z                    (Lukoianov et al. 2024)
-    recon  g = z - target in pixels, the target denoised from z_t in several steps    (Zhou & Tulsiani 2023)
+
+recon compares pixels instead, by the distance that most of the photometric loss is (Zhou & Tulsiani 2023):
+
+    (2)  L = mean( u sqrt((x - y)^2 + e^2) ),   y denoised from z_t, e = ROUND
+
 """
 
 from __future__ import annotations
@@ -20,6 +24,9 @@ from torch import Tensor
 
 from gsopt.sds.noise import Latents, Signal, add_noise, eps_from, weight
 from gsopt.sds.prior import Images, Pair, Prior, Scale, guided_x0
+
+ROUND = 0.01
+"""Differences well below this count by their square: no gradient jumps where the render has arrived."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +113,10 @@ def loss(z: Latents, g: Latents, weights: Float[Tensor, "B 1 h w"]) -> Float[Ten
     return 0.5 * (weights * (z - target).square()).mean()
 
 
-def pixel_pull(images: Images, target: Images) -> Latents:
-    """g of recon, on pixels in [-1, 1] as the network's own scale."""
-    return 2 * (images.detach() - target)
+def pixel_pull(images: Images, target: Images, weights: Float[Tensor, "S S"]) -> Images:
+    """dL/dx of equation (2)."""
+    apart = images.detach() - target
+    return weights * apart / (apart.square() + ROUND**2).sqrt() / apart.numel()
 
 
 def resized(weights: Float[Tensor, "S S"], z: Latents) -> Float[Tensor, "1 1 h w"]:

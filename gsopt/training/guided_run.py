@@ -6,6 +6,7 @@ from typing import Any
 
 from gsopt.config import TrainConfig
 from gsopt.data.scene import Scene
+from gsopt.guidance_config import settled
 from gsopt.init import first_gaussians
 from gsopt.raster.backend import Backend
 from gsopt.sds.choice import choose
@@ -47,7 +48,7 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
             verdict = Verdict(1.0, "not checked: the input views decide everywhere already", [])
         else:
             verdict = judge_guidance(config, scene, backend, prior, conditioning, weight, front, directory.warn)
-        recorded = {**recorded, **_told(verdict, prior.name, config)}
+        recorded = {**recorded, **_told(verdict, prior.name, settled(config.guidance, prior.aligned).policy)}
         directory.record(guidance=recorded)
         directory.emit("guidance", message=_sentence(verdict, weight), **recorded["guard"])
     folder.mkdir(exist_ok=True)
@@ -63,9 +64,9 @@ def decided(config: TrainConfig, scene: Scene, guide: Guide) -> bool:
     return bool((guide.mean_uncertainty(gaussians, covered) < config.guidance.min_uncertainty).all())
 
 
-def _told(verdict: Verdict, prior: str, config: TrainConfig) -> dict[str, Any]:
+def _told(verdict: Verdict, prior: str, policy: str) -> dict[str, Any]:
     guard = {"factor": verdict.factor, "reason": verdict.reason, "trials": verdict.trials}
-    return {"model": prior, "policy": config.guidance.policy, "guard": guard}
+    return {"model": prior, "policy": policy, "guard": guard}
 
 
 def _sentence(verdict: Verdict, weight: float) -> str:

@@ -19,6 +19,7 @@ from gsopt.cameras import Cameras
 from gsopt.config import InitConfig, ScheduleConfig, TrainConfig
 from gsopt.data.scene import Scene, View
 from gsopt.data.split import farthest_points
+from gsopt.guidance_config import settled
 from gsopt.init import first_gaussians
 from gsopt.metrics import psnr
 from gsopt.raster.backend import Backend, RasterSettings
@@ -77,7 +78,7 @@ def judge_guidance(
         return Verdict(1.0, "not checked: --guidance.guard-views is 0", [])
     if len(scene.train) < 2:
         return Verdict(1.0, "not checked: there is only one input view", [])
-    short = short_config(config, scene)
+    short = short_config(config, scene, prior.aligned)
     lefts = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
     lefts = [replace(left, plain=_psnr(short, left, backend, None)) for left in lefts]
     trials = []
@@ -91,12 +92,13 @@ def judge_guidance(
     return Verdict(0.0, "guidance made every left-out view worse, at a quarter of its weight too", trials)
 
 
-def short_config(config: TrainConfig, scene: Scene) -> TrainConfig:
+def short_config(config: TrainConfig, scene: Scene, view_conditioned: bool) -> TrainConfig:
     """A small copy of the run: few steps on small images, few Gaussians, no density control, guided as the run is."""
     steps = config.guidance.guard_steps
     longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
     halvings = min(6, max(0, round(math.log2(longest / SIDE))))
-    guidance = replace(config.guidance, every=min(config.guidance.every, max(1, steps // 24)))
+    guidance = settled(config.guidance, view_conditioned)
+    guidance = replace(guidance, every=min(guidance.every or 1, max(1, steps // 24)), refresh_every=max(1, steps // 8))
     return replace(
         config,
         iterations=steps,

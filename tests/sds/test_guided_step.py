@@ -23,7 +23,9 @@ from gsopt.sds.guidance import MOST_FAILURES, Guide, Seen
 
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)
-ALWAYS = GuidanceConfig(start=0.0, stop=1.0, every=1, min_uncertainty=0.0, guidance_scale=1.0, clip_rms=0.0)
+ALWAYS = GuidanceConfig(
+    policy="sds", start=0.0, stop=1.0, every=1, min_uncertainty=0.0, guidance_scale=1.0, clip_rms=0.0
+)
 SIZE = 16
 NO_WORDS = Conditioning("", (), ("",), None, None, None)
 

@@ -9,6 +9,7 @@ import torch
 from priors import NOBODY, PixelPrior, cosine_schedule, gaussian_posterior, knows, scale
 
 from gsopt.errors import InputError, NumericalError
+from gsopt.guidance_config import GuidanceConfig, settled
 from gsopt.sds import policies
 from gsopt.sds.noise import PREDICTIONS, NoiseSchedule, add_noise, eps_from, generator, output_for, weight, x0_from
 from gsopt.sds.policies import Look
@@ -247,3 +248,26 @@ def test_random_numbers_depend_on_seed_step_view_and_purpose_alone() -> None:
 def test_what_is_no_noise_schedule_is_refused(values: list[float]) -> None:
     with pytest.raises(InputError, match="alphas_cumprod"):
         NoiseSchedule.of(torch.tensor(values))
+
+
+def test_the_pull_of_recon_is_the_gradient_of_its_loss() -> None:
+    """Equation (2), by autograd in float64; nothing is pulled where the weight or the difference is 0."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.rand(1, 3, 5, 5, dtype=torch.float64, generator=generator)
+    target = torch.rand(1, 3, 5, 5, dtype=torch.float64, generator=generator)
+    target[..., 0] = images[..., 0]
+    weights = torch.rand(5, 5, dtype=torch.float64, generator=generator)
+    weights[0] = 0
+    leaf = images.clone().requires_grad_()
+    (weights * ((leaf - target).square() + policies.ROUND**2).sqrt()).mean().backward()
+    found = policies.pixel_pull(images, target, weights)
+    torch.testing.assert_close(found, leaf.grad, rtol=1e-12, atol=0)
+    assert float(found[..., 0, :].abs().max()) == float(found[..., 0].abs().max()) == 0
+
+
+def test_what_is_left_open_is_settled_by_the_kind_of_prior_and_what_was_said_stays() -> None:
+    view, text = (settled(GuidanceConfig(), view_conditioned=kind) for kind in (True, False))
+    assert (view.policy, view.every, view.guidance_scale, view.denoise_steps) == ("recon", 2, 1.0, 1)
+    assert (text.policy, text.every, text.guidance_scale, text.denoise_steps) == ("sds", 10, 3.0, 5)
+    said = GuidanceConfig(policy="sds", every=7, guidance_scale=5.0, denoise_steps=3)
+    assert settled(said, view_conditioned=True) == said
