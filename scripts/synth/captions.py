@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -16,34 +17,58 @@ if TYPE_CHECKING:
 
 SHARE_TO_NAME = 0.25
 """A second color is named when it covers at least this share of the object."""
-PALETTE = {
-    "white": (235, 235, 235),
-    "light gray": (185, 185, 185),
-    "gray": (125, 125, 125),
-    "dark gray": (70, 70, 70),
-    "black": (25, 25, 25),
-    "red": (190, 40, 40),
-    "orange": (225, 130, 45),
-    "yellow": (225, 205, 60),
-    "green": (70, 145, 65),
-    "turquoise": (70, 180, 175),
-    "blue": (55, 95, 185),
-    "purple": (125, 65, 150),
-    "pink": (225, 140, 170),
-    "brown": (110, 70, 40),
-    "beige": (215, 190, 150),
-}
+APART = 100.0
+"""A second color is named when it is at least this far from the first: gray says nothing new beside light gray."""
+PALETTE: tuple[tuple[str, tuple[int, int, int]], ...] = (
+    ("white", (235, 235, 235)),
+    ("light gray", (185, 185, 185)),
+    ("gray", (125, 125, 125)),
+    ("dark gray", (70, 70, 70)),
+    ("black", (25, 25, 25)),
+    ("red", (190, 40, 40)),
+    ("red", (110, 30, 30)),
+    ("orange", (225, 130, 45)),
+    ("yellow", (225, 205, 60)),
+    ("green", (70, 145, 65)),
+    ("green", (40, 80, 35)),
+    ("green", (105, 130, 80)),
+    ("turquoise", (70, 180, 175)),
+    ("blue", (55, 95, 185)),
+    ("blue", (35, 50, 100)),
+    ("blue", (70, 90, 120)),
+    ("blue", (130, 165, 210)),
+    ("purple", (125, 65, 150)),
+    ("pink", (225, 140, 170)),
+    ("brown", (110, 70, 40)),
+    ("brown", (150, 85, 45)),
+    ("beige", (215, 190, 150)),
+)
+"""Names and colors they stand for; a name may come in several shades."""
 
 
 def object_caption(item: Item, counts: dict[str, int]) -> str:
-    """ "a brown and white chair"; the source's own caption where it has one."""
+    """ "a brown and white chair", "red apples"; the source's own caption where it has one."""
     if item.caption:
         return item.caption
-    total = max(sum(counts.values()), 1)
-    ranked = sorted(counts, key=lambda name: (-counts[name], name))[:2]
-    words = " and ".join(name for i, name in enumerate(ranked) if i == 0 or counts[name] / total >= SHARE_TO_NAME)
-    phrase = f"{words} {item.noun.lower() if item.noun.isascii() else item.noun}".strip()
+    noun = item.noun.lower() if item.noun.isascii() else item.noun
+    phrase = f"{' and '.join(main_colors(counts))} {noun}".strip()
+    if re.search("[^su]s$", noun.partition(" with ")[0]):  # several: "apples", not "glass" or "cactus"
+        return phrase
     return f"{'an' if phrase[0] in 'aeiou' else 'a'} {phrase}"
+
+
+def main_colors(counts: dict[str, int]) -> list[str]:
+    """The most frequent color, and the next that covers enough and differs clearly."""
+    ranked = sorted((name for name in counts if counts[name]), key=lambda name: (-counts[name], name))
+    enough = SHARE_TO_NAME * sum(counts.values())
+    other = [name for name in ranked[1:] if counts[name] >= enough and distance(ranked[0], name) >= APART]
+    return ranked[:1] + other[:1]
+
+
+def distance(name: str, other: str) -> float:
+    """Between the nearest shades of two names, in the space that `count_colors` compares in."""
+    near, far = (opponent(np.array([rgb for n, rgb in PALETTE if n == key], float)) for key in (name, other))
+    return float(np.linalg.norm(near[:, None] - far, axis=2).min())
 
 
 def view_caption(caption: str, shot: Shot, front: tuple[float, float] | None) -> str:
@@ -66,9 +91,9 @@ def side_of(eye: Float[np.ndarray, "3"], front: tuple[float, float]) -> str:
 def count_colors(rgba: UInt8[np.ndarray, "H W 4"]) -> dict[str, int]:
     """How many opaque pixels are nearest to each color of the palette (in coded values, hue weighing double)."""
     seen = rgba[rgba[..., 3] > 127][::7, :3].astype(np.float64)
-    nearest = np.linalg.norm(opponent(seen)[:, None] - opponent(np.array(list(PALETTE.values()), float)), axis=2)
-    names, counts = np.unique(nearest.argmin(axis=1), return_counts=True)
-    return {list(PALETTE)[i]: int(n) for i, n in zip(names, counts, strict=True)}
+    shades = opponent(np.array([rgb for _, rgb in PALETTE], float))
+    nearest = np.linalg.norm(opponent(seen)[:, None] - shades, axis=2).argmin(axis=1)
+    return total_colors([{PALETTE[i][0]: int(n)} for i, n in zip(*np.unique(nearest, return_counts=True), strict=True)])
 
 
 def opponent(rgb: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
@@ -78,4 +103,5 @@ def opponent(rgb: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 
 def total_colors(counts: Sequence[dict[str, int]]) -> dict[str, int]:
-    return {name: sum(c.get(name, 0) for c in counts) for name in PALETTE if any(name in c for c in counts)}
+    names = dict.fromkeys(name for name, _ in PALETTE)
+    return {name: sum(c.get(name, 0) for c in counts) for name in names if any(name in c for c in counts)}

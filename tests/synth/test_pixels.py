@@ -144,6 +144,12 @@ def test_captions_say_what_is_known() -> None:
     assert captions.object_caption(chair, counts) == "a white and brown chair"
     assert captions.object_caption(Item("a", Path("a.obj")), {"orange": 3}) == "an orange object"
     assert captions.object_caption(Item("a", Path("a.obj"), caption="my own words"), counts) == "my own words"
+    apples, glass = (Item("a", Path("a.obj"), name=name) for name in ("Apples", "Glass"))
+    assert captions.object_caption(apples, {"red": 9, "green": 1}) == "red apples"
+    assert captions.object_caption(glass, {"light gray": 5, "white": 4}) == "a light gray glass"
+    assert captions.object_caption(glass, {"black": 5, "white": 4}) == "a black and white glass"
+    for name, rgb in captions.PALETTE:
+        assert captions.count_colors(np.broadcast_to(np.array([*rgb, 255], np.uint8), (7, 7, 4))) == {name: 7}
     poses = look_at_origin(np.array([(0.0, 3.0, 0.1), (3.0, 0.0, 2.0), (0.0, -3.0, -2.0), (0.0, 0.1, 3.0)]))
     seen = [captions.view_caption("x", shot(Settings(), "v", "train", p), chair.front) for p in poses]
     # Facing +y, its own left hand points to -x: a camera on +x sees its right side.
