@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from gsopt.llm_prompts.ask import Conversation
+    from gsopt.sds.prior import Encoder
 
 MOST = 64
 """Prompts that may be asked for."""
@@ -101,13 +102,33 @@ def make_prompts(job: Job, say: Say) -> Result:
 
 
 def prior_folder(prior: str) -> Path | None:
-    """The folder of a prior that is on this machine: auto, embedded, or a path; None for all else."""
+    """The folder of a prior, None where it does not lie on this machine. Fetches nothing.
+
+    Raises UsageError for what is neither a folder nor a name that a prior could have.
+    """
     from gsopt.sds.choice import EMBEDDED, is_embedded_shipped
 
     if prior in ("auto", "embedded"):
         return EMBEDDED if is_embedded_shipped() else None
     path = Path(prior).expanduser()
-    return path if path.is_dir() else None
+    return path if path.is_dir() else _cached(prior)
+
+
+def _cached(prior: str) -> Path | None:
+    """What the hub's client has on this machine."""
+    from gsopt.sds.folder import HUB_ID, SD21
+
+    name = SD21 if prior == "sd21" else prior
+    if not HUB_ID.fullmatch(name) or name.startswith("."):
+        raise UsageError(
+            f"`--prior` {prior!r:.200} is no folder that exists, no hub id and none of embedded, sd21. Correct it."
+        )
+    try:
+        from huggingface_hub import snapshot_download
+
+        return Path(snapshot_download(name, local_files_only=True))
+    except Exception:  # not installed, or not in the cache: the estimate does
+        return None
 
 
 def raw_file(output: Path) -> Path:
@@ -126,20 +147,37 @@ def scored(made: PromptSet, job: Job, views: Sequence[Image.Image]) -> PromptSet
 
     from gsopt.llm_prompts.views import to_squares
     from gsopt.sds.conditioning import encode
-    from gsopt.sds.opening import open_prior
 
-    name = "embedded" if job.prior == "auto" else job.prior
-    prior = open_prior(name, GuidanceConfig(prior=name, clip=job.clip))
-    encoder = prior.encoder()
+    encoder, size = _clip(job.clip) if job.clip else _encoder(job.prior)
     if encoder is None:
         return replace(made, made=_warned(made, ("the prior has no text encoder: prompts are not scored",)))
     with torch.no_grad():
-        squares = to_squares(views, prior.size)
+        squares = to_squares(views, size)
         known = encode(encoder, made.prompts, squares, squares[:0], 0.0, None)
     notes = known.notes
     if all(prompt.score is None for prompt in known.prompts):
         notes += ("the prior has no CLIP that joins words and pictures: prompts are not scored. Give one with --clip",)
     return replace(made, prompts=known.prompts, made=_warned(made, notes))
+
+
+def _clip(name: str) -> tuple[Encoder, int]:
+    """A CLIP of its own, and the side of its images."""
+    import torch
+
+    from gsopt.sds.clip import ClipEncoder, load_joint_clip
+    from gsopt.sds.diffusers_prior import find_part
+
+    joint = load_joint_clip(find_part(name), torch.float32)
+    return ClipEncoder(name, joint.text, None, joint), joint.image.size
+
+
+def _encoder(name: str) -> tuple[Encoder | None, int]:
+    """The prior's own."""
+    from gsopt.sds.opening import open_prior
+
+    name = "embedded" if name == "auto" else name
+    prior = open_prior(name, GuidanceConfig(prior=name))
+    return prior.encoder(), prior.size
 
 
 def _views(job: Job) -> tuple[Image.Image, ...]:

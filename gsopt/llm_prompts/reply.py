@@ -29,6 +29,7 @@ MOST_DOCUMENTS = 8
 MOST_ENTRIES = 64
 """Per list of a reply."""
 MOST_PROBLEMS = 12
+START = re.compile(r"[{\[]")
 LISTED = re.compile(r"^\s*(?:[-*\u2022]|\(?\d{1,3}[.):])\s+(\S.*)$", re.M)
 THOUGHT = re.compile(r"\A.*</think(?:ing)?>", re.S)
 WHOLE_LIST = ("prompts", "descriptions", "all")
@@ -105,7 +106,7 @@ def _json_values(text: str) -> Iterator[Any]:
     decoder = json.JSONDecoder()
     place = 0
     for _ in range(MOST_STARTS):
-        start = re.compile(r"[{\[]").search(text, place)
+        start = START.search(text, place)
         if start is None:
             return
         try:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 from gsopt.errors import InputError
-from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, View
+from gsopt.llm_prompts.clean import printable
+from gsopt.llm_prompts.schema import LONGEST_TEXT, Picture, Prompt, PromptSet, View
 
 HELP = (
     "  Enter or a: accept   e: edit the text   w: weight   v: view   r: reject   "
@@ -46,7 +47,8 @@ def line(number: int, count: int, prompt: Prompt) -> str:
     sign = "-" if prompt.polarity == "negative" else "+"
     weight = "" if prompt.weight == 1 else f" x{prompt.weight:g}"
     score = "" if prompt.score is None else f" CLIP {prompt.score:.3f}"
-    return f"{number:>3}/{count} {sign} {prompt.view:<5} {prompt.source:<8}{weight}{score}  {prompt.text}"
+    text = printable(prompt.text, LONGEST_TEXT)
+    return f"{number:>3}/{count} {sign} {prompt.view:<5} {prompt.source:<8}{weight}{score}  {text}"
 
 
 def _prompts(prompts: tuple[Prompt, ...], ask: Ask, say: Say) -> tuple[Prompt, ...]:
@@ -56,7 +58,7 @@ def _prompts(prompts: tuple[Prompt, ...], ask: Ask, say: Say) -> tuple[Prompt, .
     while number < len(shown):
         say(line(number + 1, len(shown), shown[number].prompt))
         if shown[number].prompt.rationale:
-            say(f"        why: {shown[number].prompt.rationale}")
+            say(f"        why: {printable(shown[number].prompt.rationale, LONGEST_TEXT)}")
         answer = ask("? ").strip()
         if answer == "all":
             shown[number:] = [Shown(each.prompt, True) for each in shown[number:]]
@@ -114,7 +116,8 @@ def _view(text: str) -> View:
 
 def _picture(picture: Picture, ask: Ask, say: Say) -> Picture:
     while True:
-        say(f"    picture {picture.file}, by {picture.source or 'unknown'}, from: {picture.prompt}")
+        origin = printable(f"by {picture.source or 'unknown'}, from: {picture.prompt}", LONGEST_TEXT)
+        say(f"    picture {picture.file}, {origin}")
         answer = ask("accept this picture? ").strip()
         if answer == "q":
             raise Abandoned

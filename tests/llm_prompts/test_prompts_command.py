@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from tiny_scenes import write_dataset
 
 from gsopt import cli
 from gsopt.cli.train import Guidance, guidance_config
@@ -147,9 +148,12 @@ def test_training_reads_the_prompts_and_the_pictures_that_were_accepted(tmp_path
     assert config.prompts == str(tmp_path / "prompts.json")
 
 
-def test_views_and_a_clip_score_the_prompts(tmp_path: Path, photo: Path, sd21: Path, clip_folder: Path) -> None:
-    models = ["--prior", str(sd21), "--clip", str(clip_folder), "--images", str(photo.parent)]
-    assert run(tmp_path, *models) == 0
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_views_and_a_clip_score_the_prompts(
+    tmp_path: Path, photo: Path, sd21: Path, clip_folder: Path, with_prior: bool
+) -> None:
+    models = ["--clip", str(clip_folder), "--images", str(photo.parent)]
+    assert run(tmp_path, *models, *(["--prior", str(sd21)] if with_prior else [])) == 0
     prompts = read_set(tmp_path / "prompts.json").prompts
     assert all((prompt.score is not None) == (prompt.polarity == "positive") for prompt in prompts)
     assert len({prompt.score for prompt in prompts if prompt.score is not None}) > 1
@@ -161,6 +165,35 @@ def test_a_prior_without_a_joint_space_says_that_nothing_is_scored(tmp_path: Pat
     assert {prompt.score for prompt in made.prompts} == {None}
     assert made.made is not None
     assert any("not scored" in warning for warning in made.made.warnings)
+
+
+def test_a_dataset_gives_its_input_views(tmp_path: Path) -> None:
+    from gsopt.llm_prompts.views import MOST_SENT, SIDE, read_views, to_jpegs, to_squares
+
+    scene = write_dataset(tmp_path / "cloud", train=20)
+    views = read_views([scene])
+    assert 4 <= len(views) <= 8
+    assert all(max(view.size) <= SIDE and view.mode == "RGB" for view in views)
+    assert views[0].getpixel((0, 0)) == (255, 255, 255)  # transparent pixels are white
+    assert 1 <= len(to_jpegs(views)) <= MOST_SENT
+    assert to_squares(views, 16).shape == (len(views), 3, 16, 16)
+    assert to_squares(views, 16)[0, :, 0, 0].tolist() == [1, 1, 1]
+
+
+def test_a_prior_that_cannot_exist_is_a_usage_error(tmp_path: Path, capsys) -> None:
+    assert run(tmp_path, "--prior", "no such thing") == 2
+    assert "--prior" in capsys.readouterr().err
+
+
+def test_a_hub_id_that_is_not_on_this_machine_is_not_fetched(tmp_path: Path, capsys) -> None:
+    assert run(tmp_path, "--prior", "nobody/nothing-of-this-name") == 0
+    assert "estimate" in capsys.readouterr().out
+
+
+def test_invisible_characters_of_a_file_do_not_reach_the_terminal() -> None:
+    from gsopt.llm_prompts.review import line
+
+    assert line(1, 1, Prompt("a \u202echair\nof \u200boak")).endswith("  a chair of oak")
 
 
 @pytest.mark.parametrize("broken", ["absent.png", "text.png", "empty"])
