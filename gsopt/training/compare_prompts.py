@@ -77,14 +77,14 @@ def compare_prompts(
             f"The prior {prior.name} takes no words: every set of prompts would give the same. Name a Stable Diffusion "
             "model with --prior sd21 or a diffusers folder."
         )
-    short = short_config(config, scene)
+    short = short_config(config, scene, prior.aligned)
     lefts = [without(scene, index) for index in spread_views(scene, max(1, config.guidance.guard_views))]
     truths: list[Tensor] = []
     outcomes = []
     for arm in arms:
         drawn, scores = [], []
         for left in lefts:
-            known = None if arm.weight == 0 else _conditioning(config, left, prior, arm)
+            known = None if arm.weight == 0 else _conditioning(short, left, prior, arm)
             front = front_camera(config, left.scene)
             aid = None if known is None else (prior, known, arm.weight, front, say)
             picture, truth = short_run(short, left, backend, aid)
