@@ -72,7 +72,7 @@ def run_and_stop(found: dict[str, Any]) -> None:
     bpy.ops.wm.open_mainfile(filepath=path)
     settings = bpy.context.scene.gsopt
     call(bpy.ops.gsopt.follow, step=settings.run_step + 5, seconds=1800.0)
-    found["re-attached"] = [settings.run_status, settings.run_step]
+    found["re-attached"] = [settings.run_status, settings.run_step, bool(settings.run_job)]
     call(bpy.ops.gsopt.stop)
     found["stopped"] = [settings.run_status, settings.run_step]
     settings.run_status = ""
@@ -80,7 +80,7 @@ def run_and_stop(found: dict[str, Any]) -> None:
     call(bpy.ops.gsopt.attach, directory=settings.runs[0].path)
     found["attached"] = settings.run_status
     call(bpy.ops.gsopt.resume, wait=False)
-    call(bpy.ops.gsopt.follow, step=settings.run_step + 30, seconds=1800.0)
+    call(bpy.ops.gsopt.follow, step=found["stopped"][1] + 5, seconds=1800.0)
     found["resumed"] = [settings.run_status, settings.run_step]
     call(bpy.ops.gsopt.stop)
 
