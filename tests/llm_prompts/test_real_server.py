@@ -26,6 +26,7 @@ MODEL = os.environ.get("GSOPT_SERVE_MODEL", "")
 pytestmark = pytest.mark.skipif(not PYTHON, reason="opt-in: make test-llm")
 PATIENCE = 900.0
 """Seconds for a server to start, and for a model to answer."""
+SMALL = Path(__file__).resolve().parents[2] / "docs" / "howto" / "prompts" / "small-models.md"
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +66,11 @@ def wait_until_it_answers(url: str, process: subprocess.Popen[bytes], log: Path)
     raise AssertionError(f"no answer from {url}: {log.read_text(errors='replace')[-3000:]}")
 
 
-def test_a_real_server_ends_in_valid_prompts_that_say_who_wrote_them(served, tmp_path: Path) -> None:
+@pytest.mark.parametrize("domain", ["generic", str(SMALL)], ids=["generic", "small-models"])
+def test_a_real_server_ends_in_valid_prompts_that_say_who_wrote_them(served, tmp_path: Path, domain: str) -> None:
     url, model = served
     output = tmp_path / "prompts.json"
-    few = ["-n", "2", "--negatives", "0", "--temperature", "0.3", "--timeout", str(PATIENCE)]
+    few = ["-n", "2", "--negatives", "0", "--temperature", "0.3", "--timeout", str(PATIENCE), "--domain", domain]
     command = ["prompts", "--notes", "worn oak chair", *few, "--llm", url, "--model", model]
     assert cli.main([*command, "--fallback", "-o", str(output)]) == 0
     made = read_set(output)
