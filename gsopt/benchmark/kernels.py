@@ -61,7 +61,7 @@ def read_count(flag: str, text: str) -> int:
     """12k, 3M or 500 as a number; UsageError for anything else."""
     match = re.fullmatch(r"(\d+)(k|M|)", text)
     if match is None:
-        raise UsageError(f"`{flag}` must be numbers like 500, 12k or 3M, got {text!r}.")
+        raise UsageError(f"`{flag}` must be numbers like 500, 12k or 3M, got {text!r}. Try 12k.")
     count = int(match[1]) * UNITS[match[2]]
     check.within(flag, count, 1, 100_000_000, "Give a number of Gaussians.")
     return count
