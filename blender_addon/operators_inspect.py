@@ -217,9 +217,9 @@ class GSOPT_OT_statistics(Telling, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         mesh = active_splats(context).data
-        shown = splat_object.read_mesh(mesh).rows(~splat_object.hidden(mesh))
+        shown = splat_object.read_mesh(mesh, harmonics=False).rows(~splat_object.hidden(mesh))
         found = loading.SUMMARIES[mesh.name] = statistics.summary(shown)
-        return f"{found.count:,} splats, {found.outliers:,} outliers, SH degree {found.sh_degree}"
+        return f"{found.count:,} splats, {found.outliers:,} outliers"
 
 
 class GSOPT_OT_filter(Telling, bpy.types.Operator):
@@ -231,10 +231,10 @@ class GSOPT_OT_filter(Telling, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         thing = active_splats(context)
-        splats = splat_object.read_mesh(thing.data)
+        splats = splat_object.read_mesh(thing.data, harmonics=False)
         kept = chosen_filter(context.scene.gsopt, thing).keeps(splats)
         splat_object.hide(thing.data, ~kept)
-        loading.SUMMARIES[thing.data.name] = statistics.summary(splats.rows(kept))
+        loading.SUMMARIES.pop(thing.data.name, None)
         return f"{int(kept.sum()):,} of {len(kept):,} splats pass"
 
 

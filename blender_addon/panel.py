@@ -158,7 +158,8 @@ class GSOPT_PT_guidance(Child, bpy.types.Panel):
 def draw_proposal(layout: Any, settings: Any) -> None:
     """The first proposal, to be accepted, edited or rejected."""
     box, entry = layout.box(), settings.proposals[0]
-    box.label(text=f"{len(settings.proposals)} proposals, by {entry.source}")
+    count = len(settings.proposals)
+    box.label(text=f"{count} proposal{'s' * (count != 1)}, by {entry.source}")
     box.prop(entry, "text", text="")
     row = box.row(align=True)
     for name in ("weight", "view", "polarity"):
@@ -193,6 +194,7 @@ def draw_prompts(layout: Any, settings: Any) -> None:
 
 
 def draw_references(layout: Any, settings: Any) -> None:
+    layout.label(text="Reference images")
     row = layout.row()
     row.template_list(
         "GSOPT_UL_paths", "references", settings, "references", settings, "reference_index", rows=1, maxrows=4
@@ -294,7 +296,7 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
         row.operator("gsopt.import_cameras", text="Cameras", icon="OUTLINER_OB_CAMERA")
         row.operator("gsopt.look_through", text="", icon="TRIA_LEFT").step = -1
         row.operator("gsopt.look_through", text="", icon="TRIA_RIGHT").step = 1
-        row.prop(settings, "picture", text="Picture", slider=True)
+        layout.prop(settings, "picture", text="Input Picture", slider=True)
         active = context.view_layer.objects.active
         if splat_object.is_splats(active):
             draw_display(layout, active)
@@ -318,7 +320,7 @@ def draw_summary(layout: Any, thing: Any) -> None:
     found = loading.SUMMARIES.get(thing.data.name)
     if found is None or not found.count:
         return
-    box.label(text=f"{found.count:,} splats, {found.outliers:,} outliers, SH {found.sh_degree}")
+    box.label(text=f"{found.count:,} splats, {found.outliers:,} outliers")
     row = box.row()
     for title, bars in (("Opacity", found.opacities), ("Size", found.sizes)):
         column = row.column(align=True)

@@ -77,10 +77,13 @@ def get(mesh: Any, name: str) -> Any:
     return values.reshape(len(mesh.vertices), WIDTHS[kind])
 
 
-def read_mesh(mesh: Any) -> Splats:
-    """The splats of a mesh, in its own frame. InputError where attributes are missing."""
+def read_mesh(mesh: Any, harmonics: bool = True) -> Splats:
+    """The splats of a mesh, in its own frame. InputError where attributes are missing.
+
+    Without `harmonics` only the base color is read, which is a quarter of the data.
+    """
     bands = 0
-    while f"radiance:sh_{bands}" in mesh.attributes:
+    while harmonics and f"radiance:sh_{bands}" in mesh.attributes:
         bands += 1
     bands = max(known for known in (0, 3, 8, 15) if known <= bands)
     sh = np.empty((len(mesh.vertices), bands, 3), np.float32)

@@ -142,7 +142,8 @@ def test_cameras_look_where_the_poses_say(panel: Any, tmp_path: Path) -> None:
     scene = bpy.context.scene
     bpy.context.view_layer.update()
     point = Vector((1.0, 1.3, 1.9))
-    x, y, z = (Vector(row[:3]).dot(point - Vector((4, 1, 2))) for row in zip(*pose[:3], strict=True))
+    axes = [Vector(column) for column in zip(*[row[:3] for row in pose[:3]], strict=True)]
+    x, y, z = (axis.dot(point - Vector((4, 1, 2))) for axis in axes)
     expected = (90 + 120 * x / -z) / 200, 1 - (60 - 120 * y / -z) / 100
     seen = world_to_camera_view(scene, scene.camera, point)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (200, 100)
