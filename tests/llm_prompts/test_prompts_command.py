@@ -159,8 +159,11 @@ def test_views_and_a_clip_score_the_prompts(
     assert len({prompt.score for prompt in prompts if prompt.score is not None}) > 1
 
 
-def test_a_prior_without_a_joint_space_says_that_nothing_is_scored(tmp_path: Path, photo: Path, sd21: Path) -> None:
-    assert run(tmp_path, "--prior", str(sd21), "--images", str(photo)) == 0
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_without_a_joint_space_nothing_is_scored_and_it_is_said(
+    tmp_path: Path, photo: Path, sd21: Path, with_prior: bool
+) -> None:
+    assert run(tmp_path, "--images", str(photo), *(["--prior", str(sd21)] if with_prior else [])) == 0
     made = read_set(tmp_path / "prompts.json")
     assert {prompt.score for prompt in made.prompts} == {None}
     assert made.made is not None
