@@ -60,6 +60,7 @@ class GSOPT_OT_launch(Waiting, bpy.types.Operator):
 
 def training(settings: Any) -> arguments.Training:
     return arguments.Training(
+        preset="" if settings.preset == "own" else settings.preset,
         iterations=settings.iterations,
         downscale=settings.downscale,
         max_gaussians=settings.budget,

@@ -214,7 +214,7 @@ class GSOPT_PT_run(Child, bpy.types.Panel):
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
-        if settings.preset == "OWN":
+        if settings.preset == "own":
             for name in ("iterations", "downscale", "strategy", "background", "hold_out"):
                 column.prop(settings, name)
         for name in ("budget", "views", "threads", "live"):

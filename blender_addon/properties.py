@@ -17,7 +17,6 @@ from bpy.props import (
 )
 
 from . import nodes, splat_object
-from .core import arguments
 
 SOURCES = [
     ("MESH", "Mesh", "Render views of the selected objects or of a collection of this scene"),
@@ -40,10 +39,10 @@ PRIORS = [
     ("FOLDER", "Folder", "A model in diffusers' layout"),
 ]
 PRESETS = [
-    ("DRAFT", "Draft", "1000 steps at half the size"),
-    ("STANDARD", "Standard", "7000 steps"),
-    ("FINE", "Fine", "30,000 steps"),
-    ("OWN", "Own", "As set below"),
+    ("draft", "Draft", "About 2000 steps with more skips"),
+    ("default", "Default", "7000 steps"),
+    ("high", "High", "15,000 steps"),
+    ("own", "Own", "As set below"),
 ]
 STATES = [(name, name.title(), "") for name in ("NONE", "RUNNING", "DONE", "FAILED")]
 DISPLAYS = [(name, name, "") for name in nodes.DISPLAYS]
@@ -79,12 +78,6 @@ class GsoptJob(bpy.types.PropertyGroup):
     folder: StringProperty()  # type: ignore[valid-type]
     message: StringProperty()  # type: ignore[valid-type]
     share: FloatProperty(min=0.0, max=1.0)  # type: ignore[valid-type]
-
-
-def choose_preset(self: Any, context: Any) -> None:
-    preset = arguments.PRESETS.get(self.preset)
-    if preset is not None:
-        self.iterations, self.downscale = preset.iterations, preset.downscale
 
 
 class GsoptScene(bpy.types.PropertyGroup):
@@ -125,7 +118,7 @@ class GsoptScene(bpy.types.PropertyGroup):
         name="Front View", default=-1, min=-1, description="Number of the input view that shows the front; -1: not said"
     )  # type: ignore[valid-type]
 
-    preset: EnumProperty(name="Preset", items=PRESETS, default="STANDARD", update=choose_preset)  # type: ignore[valid-type]
+    preset: EnumProperty(name="Preset", items=PRESETS, default="default")  # type: ignore[valid-type]
     iterations: IntProperty(name="Steps", default=7000, min=1)  # type: ignore[valid-type]
     downscale: IntProperty(name="Divide Size by", default=1, min=1, max=16)  # type: ignore[valid-type]
     budget: IntProperty(name="Most Gaussians", default=0, min=0, description="0: as many as the images call for")  # type: ignore[valid-type]

@@ -6,6 +6,7 @@ folders of jobs and runs.
 
 from __future__ import annotations
 
+import json
 import time
 import traceback
 from collections.abc import Callable
@@ -132,8 +133,11 @@ def finish_poses(scene: Any, work: job.Job) -> None:
 def finish_prompts(scene: Any, work: job.Job) -> None:
     if not Path(work.product).is_file():
         raise GsoptError(job.complaint(work))
+    found = prompts.read_prompts(Path(work.product))
+    about = {key: found.rest[key] for key in ("notes", "object", "domain") if key in found.rest}
+    scene.gsopt.prompts_rest = json.dumps(about)
     scene.gsopt.proposals.clear()
-    for prompt in prompts.read_prompts(Path(work.product)).prompts:
+    for prompt in found.prompts:
         fill_prompt(scene.gsopt.proposals.add(), prompt)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif", ".bmp")
@@ -13,6 +13,8 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 class Training:
     """What `gsopt train` is asked for."""
 
+    preset: str = ""
+    """draft, default or high; empty: steps and size as given here."""
     iterations: int = 7000
     downscale: int = 1
     """Width and height are divided by this."""
@@ -28,11 +30,8 @@ class Training:
     backend: str = "auto"
 
 
-PRESETS = {
-    "DRAFT": Training(iterations=1000, downscale=2),
-    "STANDARD": Training(iterations=7000),
-    "FINE": Training(iterations=30_000),
-}
+STEPS = {"draft": 2000, "default": 7000, "high": 15_000}
+"""About as many as gsopt's presets take: decides how often a preview comes."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +51,12 @@ class Guidance:
 def train(python: Path, data: Path, run: Path, training: Training, guidance: Guidance) -> list[str]:
     """`gsopt train` with a live preview about twenty times."""
     words = [str(python), "-m", "gsopt", "train", str(data), "-m", str(run)]
-    words += ["--iterations", str(training.iterations), "--seed", str(training.seed)]
-    words += ["--preview-every", str(max(25, min(500, training.iterations // 20)))]
+    words += ["--preset", training.preset] if training.preset else ["--iterations", str(training.iterations)]
+    steps = STEPS.get(training.preset, training.iterations)
+    words += ["--preview-every", str(max(25, min(500, steps // 20))), "--seed", str(training.seed)]
     words += ["--strategy", training.strategy, "--background", training.background]
     words += ["--threads", str(training.threads), "--backend", training.backend]
-    words += ["--resolution", str(training.downscale)] if training.downscale > 1 else []
+    words += ["--resolution", str(training.downscale)] if training.downscale > 1 and not training.preset else []
     words += ["--max-gaussians", str(training.max_gaussians)] if training.max_gaussians else []
     words += ["--views", str(training.views)] if training.views else []
     words += ["--eval"] if training.hold_out else []
@@ -139,12 +139,6 @@ def render(blender: str, python: Path | str, script: Path, mesh: Path, out: Path
     words += ["--samples", str(rendering.samples), "--lighting", rendering.lighting]
     words += ["--seed", str(rendering.seed), "--threads", str(rendering.threads), "--points", "10000"]
     return words + (["--masks"] if rendering.masks else [])
-
-
-def with_preset(training: Training, preset: str) -> Training:
-    """The settings of a preset in place of those given; unknown presets change nothing."""
-    chosen = PRESETS.get(preset)
-    return training if chosen is None else replace(training, iterations=chosen.iterations, downscale=chosen.downscale)
 
 
 def needs_poses(source: Path) -> bool:

@@ -47,7 +47,7 @@ def prepare(work: Path) -> Any:
     settings.render_views, settings.render_test_views = VIEWS, TEST_VIEWS
     settings.render_size, settings.render_samples = SIZE, 2
     settings.threads, settings.prior = 1, "off"
-    settings.preset, settings.iterations = "OWN", 4000
+    settings.preset, settings.iterations = "own", 4000
     return settings
 
 

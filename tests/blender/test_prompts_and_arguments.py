@@ -72,7 +72,7 @@ def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, data: bytes) -> 
 
 
 EVERYTHING = (
-    arguments.Training(50, 2, 999, 4, True, "mcmc", "black", 7, 1, "reference"),
+    arguments.Training("", 50, 2, 999, 4, True, "mcmc", "black", 7, 1, "reference"),
     arguments.Guidance("off"),
 )
 
@@ -81,7 +81,7 @@ EVERYTHING = (
     ("training", "guidance"),
     [
         (arguments.Training(), arguments.Guidance()),
-        (arguments.with_preset(arguments.Training(views=4), "DRAFT"), arguments.Guidance("off")),
+        (arguments.Training(preset="high", views=4), arguments.Guidance("off")),
         EVERYTHING,
         (arguments.Training(), arguments.Guidance("embedded", 0.3, None, (Path("a b.png"),), "cpu", 2)),
     ],
@@ -97,6 +97,7 @@ def test_gsopt_takes_the_flags(
     words = arguments.train(Path("python"), tmp_path / "a b", tmp_path / "-run", training, guidance)
     assert words[:4] == ["python", "-m", "gsopt", "train"]
     flags = tyro.cli(Flags, args=words[4:])
+    assert flags.preset == (training.preset or "default")
     assert (flags.iterations, flags.resolution, flags.seed) == (training.iterations, training.downscale, training.seed)
     assert (flags.views or 0, flags.density.max_gaussians or 0) == (training.views, training.max_gaussians)
     assert (flags.density.strategy, flags.background) == (training.strategy, training.background)
@@ -123,6 +124,17 @@ def test_gsopt_sfm_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(Asked) as asked:
         sfm.main(words[4:])
     assert asked.value.args == (tmp_path, tmp_path / "a posed", 3, 1)
+
+
+def test_gsopt_prompts_takes_the_flags(tmp_path: Path) -> None:
+    tyro = pytest.importorskip("tyro")
+    from gsopt.cli.prompts import Flags
+
+    writing = arguments.Writing("-- a chair; rm", "medicine", 6, "http://localhost:1/v1", "qwen", (tmp_path,))
+    flags = tyro.cli(Flags, args=arguments.prompts(Path("python"), writing, tmp_path / "p.json")[4:])
+    assert (flags.notes, flags.domain, flags.n) == ("-- a chair; rm", "medicine", 6)
+    assert (flags.llm, flags.model, flags.images) == ("http://localhost:1/v1", "qwen", (tmp_path,))
+    assert flags.output == tmp_path / "p.json"
 
 
 def test_synth_views_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
