@@ -9,8 +9,10 @@ from pathlib import Path
 
 import json_schema
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from reply_cases import CASES, GOOD, KEY, VALID, Case
-from scripted_server import completion, error, free_port, serving
+from scripted_server import Says, completion, error, free_port, serving
 
 from gsopt import cli
 from gsopt.errors import GsoptError, UsageError
@@ -73,6 +75,36 @@ def test_the_docs_list_exactly_these_cases() -> None:
         PAGE.write_text(page, encoding="utf-8")
     listed = [line for line in page[page.index("<!-- replies -->") :].splitlines() if line.startswith("| ")]
     assert listed[1:] == rows
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["choices", "message", "content", "error", "usage", "prompt_tokens", "text"]),
+            inner,
+            max_size=3,
+        )
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    body=st.binary(max_size=80) | JSON.map(json.dumps).map(str.encode),
+    status=st.sampled_from([200, 201, 204, 299, 300, 400, 418, 500, 599]),
+    announced=st.none() | st.integers(0, 100),
+)
+def test_any_bytes_are_an_answer_or_a_refusal(body: bytes, status: int, announced: int | None) -> None:
+    with serving([Says(body, status, announced=announced)]) as server:
+        try:
+            said = client.chat(connect(server.url, "tiny", 60.0, {}), {"messages": []}).finish
+        except client.Refusal as refusal:
+            said = str(refusal)
+    assert said.isprintable()
+    assert len(said) < 1000
 
 
 def test_a_fallback_is_named_template_and_says_why(tmp_path: Path, capsys) -> None:
