@@ -19,7 +19,7 @@ from gsopt.errors import GsoptError
 from gsopt.events import read_events
 from gsopt.film import as_image
 from gsopt.render import FinishedRun, film_path, fitted, open_run, truth
-from gsopt.report import guided
+from gsopt.report import guided, posed
 from gsopt.report.pictures import shrunk
 
 JUDGED_SHOWN = 12
@@ -78,6 +78,8 @@ class Report:
     turntable: list[Image.Image] = field(default_factory=list)
     guidance: str = ""
     """Finished HTML."""
+    cameras: str = ""
+    """Finished HTML."""
 
 
 @torch.no_grad()
@@ -95,6 +97,7 @@ def gather(run: Path, config: TrainConfig) -> Report:
     )
     messages += [text for event in events if (text := _message(event)) is not None]
     report.guidance = guided.section(run, messages)
+    report.cameras = posed.section(Path(config.data.path), run, messages)
     _take_figures(report)
     try:
         scene = load_scene(config.data)

@@ -27,13 +27,13 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 def page(report: Report) -> str:
     """The whole document."""
     style = (resources.files("gsopt.report") / "style.css").read_text(encoding="utf-8")
-    sections = (header(report), messages(report), views(report), inputs(report), report.guidance, course(report))
+    sections = [header(report), messages(report), views(report), inputs(report), report.cameras, report.guidance]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
         f'content="light dark"><link rel="icon" href="data:,"><title>{escape(report.name)} · gsopt report</title>'
-        f"<style>\n{style}</style></head>\n<body><main>\n{''.join(sections)}{settings(report)}</main>\n{footer(report)}</body></html>\n"
+        f"<style>\n{style}</style></head>\n<body><main>\n{''.join(sections)}{course(report)}{settings(report)}</main>\n{footer(report)}</body></html>\n"
     )
 
 

@@ -183,6 +183,7 @@ class _Run:
             "settings": asdict(self.config),
             "matching": matching,
             "masks": masked.kind,
+            "report": report.lines(),
             **asdict(report),
             "placed_from_found": {
                 "scale": similarity.scale,
