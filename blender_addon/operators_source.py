@@ -107,6 +107,9 @@ def write_shapes(folder: Path, shapes: list[Any]) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         for shape in shapes:
             stage.collection.objects.link(shape)
+        stage.view_layers[
+            0
+        ].update()  # Blender 5.2 crashes on writing a scene whose layers were never brought up to date
         bpy.data.libraries.write(str(path), {stage}, path_remap="ABSOLUTE", compress=False)
     except (OSError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {error}. Free some space or choose another work folder.") from error
