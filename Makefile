@@ -83,8 +83,8 @@ BLENDER ?= blender
 SPLATS ?= runs/demo/splat.ply
 test-blender-gui:
 	rm -rf build/blender-window
-	LIBGL_ALWAYS_SOFTWARE=1 xvfb-run -s "-screen 0 1500x1400x24" $(BLENDER) --factory-startup \
-	  --window-geometry 0 0 1500 1400 --python tests/blender/gui.py -- build/blender-window $(SPLATS) gsopt/demo
+	LIBGL_ALWAYS_SOFTWARE=1 xvfb-run -s "-screen 0 1300x1250x24" $(BLENDER) --factory-startup \
+	  --window-geometry 0 0 1300 1250 --python tests/blender/gui.py -- build/blender-window $(SPLATS) gsopt/demo
 	@cat build/blender-window/found.json; grep -q '"ok": true' build/blender-window/found.json
 
 # dist/gsopt-<version>.zip, to be installed in Blender's preferences.

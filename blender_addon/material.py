@@ -68,7 +68,9 @@ def mixed(graph: Graph, instanced: Value, out: int) -> Value:
 
 
 def let_cycles_see_through(scene: Any) -> None:
-    """Raise the number of transparent surfaces that Cycles follows."""
+    """Raise the number of transparent surfaces that Cycles follows, and the first ones it follows without dice: light
+    and transparency alone then give a picture without noise."""
     cycles = getattr(scene, "cycles", None)
-    if cycles is not None and cycles.transparent_max_bounces < DEPTH:
-        cycles.transparent_max_bounces = DEPTH
+    if cycles is not None:
+        cycles.transparent_max_bounces = max(DEPTH, cycles.transparent_max_bounces)
+        cycles.min_transparent_bounces = max(DEPTH // 2, cycles.min_transparent_bounces)

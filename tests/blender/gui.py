@@ -62,7 +62,8 @@ def set_up() -> None:
         bpy.data.objects.remove(other)
     space.show_region_ui = True
     space.overlay.show_floor = space.overlay.show_axis_x = space.overlay.show_axis_y = False
-    space.shading.type = "MATERIAL"
+    bpy.context.scene.eevee.taa_samples = 1  # without a graphics card every sample takes seconds
+    space.shading.type = "SOLID"
     with bpy.context.temp_override(window=window, area=area):
         bpy.ops.screen.screen_full_area()
 
@@ -117,7 +118,7 @@ def story(out: Path, splats: Path, data: Path | None, found: dict[str, Any]) -> 
     run = out / "run"
     script = Path(__file__).with_name("stand_in_run.py")
     python = sys.executable
-    process = subprocess.Popen([python, str(script), str(run), str(splats), "40"])
+    process = subprocess.Popen([python, str(script), str(run), str(splats), "60"])
     yield from until((run / "events.jsonl").exists)
     watching.TIMES.clear()
     bpy.ops.gsopt.attach(directory=str(run))
@@ -143,6 +144,7 @@ def look(out: Path, data: Path | None) -> Iterator[float]:
     frame_selected()
     bpy.ops.gsopt.statistics()
     scroll(3)
+    view()[2].shading.type = "MATERIAL"
     yield from settle()
     yield 10.0
     shoot(out, "4_inspect")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -282,12 +281,3 @@ def test_enabling_and_disabling_leaves_nothing_behind(panel: Any) -> None:
         assert not bpy.app.timers.is_registered(watching.tick)
         assert not [name for name in dir(bpy.types) if name.startswith("GSOPT_")]
         blender_addon.register()
-
-
-def test_no_torch_comes_into_blender(panel: Any) -> None:
-    names = {
-        name.partition(".")[0]
-        for name in sys.modules
-        if "blender_addon" in str(getattr(sys.modules[name], "__file__", ""))
-    }
-    assert names == {"blender_addon"}
