@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 MOST = 64
 """Prompts that may be asked for."""
 LONGEST_TIMEOUT = 24 * 3600.0
+NOT_SCORED = "the prompts are not scored: the prior has no CLIP that joins words and pictures; give one with --clip"
 
 Say = Callable[[str], None]
 
@@ -96,8 +97,10 @@ def make_prompts(job: Job, say: Say) -> Result:
     else:
         result = _with_model(job, wish, template, counter, views, say)
     made = result.made
-    if views and (folder is not None or job.clip):
+    if views and (job.clip or (folder is not None and (folder / "text_encoder").is_dir())):
         made = scored(made, job, views)
+    elif views:
+        made = replace(made, made=_warned(made, (NOT_SCORED,)))
     return replace(result, made=replace(made, made=_warned(made, _too_long(made.prompts, counter))))
 
 
@@ -150,13 +153,13 @@ def scored(made: PromptSet, job: Job, views: Sequence[Image.Image]) -> PromptSet
 
     encoder, size = _clip(job.clip) if job.clip else _encoder(job.prior)
     if encoder is None:
-        return replace(made, made=_warned(made, ("the prior has no text encoder: prompts are not scored",)))
+        return replace(made, made=_warned(made, (NOT_SCORED,)))
     with torch.no_grad():
         squares = to_squares(views, size)
         known = encode(encoder, made.prompts, squares, squares[:0], 0.0, None)
     notes = known.notes
     if all(prompt.score is None for prompt in known.prompts):
-        notes += ("the prior has no CLIP that joins words and pictures: prompts are not scored. Give one with --clip",)
+        notes += (NOT_SCORED,)
     return replace(made, prompts=known.prompts, made=_warned(made, notes))
 
 
@@ -200,6 +203,7 @@ def _with_model(
     try:
         server = connect(job.llm, job.model, job.timeout)
         source = source_of(server.model)
+        say(f"asking {source} at {server.url}, for at most {job.timeout:g} s")
         request = Request(template, wish, job.temperature, job.seed, to_jpegs(views))
         talk = converse(server, request, counter, say)
     except Refusal as refusal:
