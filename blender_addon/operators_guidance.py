@@ -110,6 +110,8 @@ class GSOPT_OT_propose(Waiting, bpy.types.Operator):
         settings, machine = context.scene.gsopt, preferences(context)
         if not settings.notes.strip():
             raise UsageError("The notes are empty. Say in a few words what the object is and what you know about it.")
+        if settings.domain == "own" and not settings.template:
+            raise UsageError("The domain is your own, but no template is chosen. Choose a Markdown file.")
         domain = str(absolute(settings.template)) if settings.domain == "own" else settings.domain
         writing = arguments.Writing(settings.notes, domain, llm=machine.llm or "none", model=machine.model)
         folder = job.free_folder(work_folder(context) / "jobs", "prompts")
@@ -174,6 +176,8 @@ class GSOPT_OT_reference_remove(Telling, bpy.types.Operator):
 
 def guidance(settings: Any, folder: Path) -> arguments.Guidance:
     """What the panel says about guidance; its prompts are written into `folder`."""
+    if settings.prior == "FOLDER" and not settings.prior_folder:
+        raise UsageError("The prior is a folder, but none is chosen. Choose a model in diffusers' layout.")
     listed = document(settings)
     path = folder / "prompts.json"
     if listed.prompts and settings.prior != "off":

@@ -72,9 +72,12 @@ class GSOPT_OT_import_splats(Waiting, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         scene, settings = context.scene, context.scene.gsopt
-        if settings.job_import.state == "RUNNING" and "import" in watching._loads:
+        if watching.is_importing():
             raise UsageError("A file is being imported. Wait for it.")
-        source = absolute(settings.run_path if self.from_run else self.filepath)
+        chosen = settings.run_path if self.from_run else self.filepath
+        if not chosen:
+            raise UsageError("No splats are named. Choose a file, or attach to a run first.")
+        source = absolute(chosen)
         path = loading.splat_file(source)
         run = source if source.is_dir() else path.parent
         matrix, name = frame(settings, data_of(run)), scene.name_full

@@ -49,7 +49,8 @@ class GSOPT_OT_launch(Waiting, bpy.types.Operator):
         data = absolute(settings.photos if settings.source == "PHOTOS" else settings.dataset)
         if not (settings.photos if settings.source == "PHOTOS" else settings.dataset) or not data.exists():
             raise InputError("There is no dataset. Render one, choose a folder, or find the poses of photos.")
-        nodes.node_group(bpy), splat_material(bpy)  # made now, so that previews need not wait for them
+        nodes.node_group(bpy)  # both made now, so that no preview has to wait for them
+        splat_material(bpy)
         work = work_folder(context)
         run = job.free_folder(work / "runs", safe(data))
         folder = job.free_folder(work / "jobs", "train")

@@ -32,8 +32,7 @@ CLASSES = (
 @persistent
 def after_load(*_: Any) -> None:
     """A file was opened: whatever it left running is followed again."""
-    watching.forget()
-    watching.watch()
+    watching.pick_up()
 
 
 def menu(self: Any, context: Any) -> None:

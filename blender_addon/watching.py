@@ -46,6 +46,15 @@ def forget() -> None:
         bpy.app.timers.unregister(tick)
 
 
+def pick_up() -> None:
+    """After a file was opened: follow what it left running; an import it was saved in the middle of is over."""
+    forget()
+    for scene in bpy.data.scenes:
+        if scene.gsopt.job_import.state == "RUNNING":
+            scene.gsopt.job_import.state = "NONE"
+    watch()
+
+
 def tick() -> float | None:
     """One look at everything; None when there is nothing left to look at."""
     began = time.perf_counter()
@@ -244,6 +253,10 @@ def load(scene: Any, path: Path, finish: Callable[[Any, Summary], None]) -> load
     _loads["import"] = loading.Loading(path, 0, finish)
     watch()
     return _loads["import"]
+
+
+def is_importing() -> bool:
+    return "import" in _loads
 
 
 def look_at_loading(scene: Any) -> bool:
