@@ -48,11 +48,11 @@ def write_folder(
 
 
 def _origin(scene: Path) -> dict[str, str]:
-    """Name, category and licence of a scene, as far as the renderer of a mesh wrote them beside it."""
+    """Name, category, creator and licence of a scene, as far as the renderer of a mesh wrote them beside it."""
     known: dict[str, Any] = {}
     if is_regular(scene / "object.json"):
         known = json.loads((scene / "object.json").read_text("utf-8"))
-    text = {key: str(known.get(key) or "not stated").splitlines()[0][:80] for key in ("category", "license")}
+    text = {key: str(known.get(key) or "not stated").splitlines()[0][:80] for key in ("category", "creator", "license")}
     return {"name": scene.name, **text}
 
 
@@ -85,9 +85,9 @@ def model_card(
         "",
         "## Training data",
         "",
-        "| scene | category | licence |",
-        "|---|---|---|",
-        *(f"| {scene['name']} | {scene['category']} | {scene['license']} |" for scene in scenes),
+        "| scene | category | creator | licence |",
+        "|---|---|---|---|",
+        *(f"| {' | '.join(scene[key] for key in ('name', 'category', 'creator', 'license'))} |" for scene in scenes),
         "",
     ]
     return "\n".join(lines)

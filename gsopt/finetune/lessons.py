@@ -58,12 +58,12 @@ class Images:
 
 
 def on_background(pairs: Pairs, background: Float[Tensor, "B 3"]) -> Images:
-    """Bytes to floats, composited."""
+    """Bytes to floats, composited; a render that is brighter than white is white, as a run shows it."""
     b = background[:, :, None, None]
     truth, render, u, warped = (getattr(pairs, item.name).float() / 255 for item in fields(Pairs))
     return Images(
         truth[:, :3] + (1 - truth[:, 3:]) * b,
-        torch.cat([render[:, :3] + (1 - render[:, 3:]) * b, render[:, 3:]], 1),
+        torch.cat([(render[:, :3] + (1 - render[:, 3:]) * b).clamp(0, 1), render[:, 3:]], 1),
         u,
         torch.cat([warped[:, :, :3] + (1 - warped[:, :, 3:4]) * b[:, None], warped[:, :, 4:]], 2),
     )

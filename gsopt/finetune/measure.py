@@ -15,7 +15,7 @@ from gsopt.sds.noise import add_noise, generator
 from gsopt.sds.view_prior import cosine_schedule, predict
 
 TIMES = (300, 500, 700, 900)
-MOST = 160
+MOST = 48
 """Renders that are measured, evenly spread over the held-out scenes."""
 SHOWN = 8
 SUBSETS: dict[str, tuple[bool, bool]] = {

@@ -109,10 +109,10 @@ def prior_folder(prior: str) -> Path | None:
 
     Raises UsageError for what is neither a folder nor a name that a prior could have.
     """
-    from gsopt.sds.choice import EMBEDDED, is_embedded_shipped
+    from gsopt.sds.choice import EMBEDDED, what_embedded_lacks
 
     if prior in ("auto", "embedded"):
-        return EMBEDDED if is_embedded_shipped() else None
+        return EMBEDDED if what_embedded_lacks() is None else None
     path = Path(prior).expanduser()
     return path if path.is_dir() else _cached(prior)
 

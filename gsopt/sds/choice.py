@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,9 @@ from gsopt.guidance_config import GuidanceConfig
 
 DEFAULT_WEIGHT = 0.2
 EMBEDDED = Path(__file__).with_name("embedded")
-"""Where the embedded prior's diffusers folder lies once there is one."""
-NONE_AT_HAND = "no prior at hand: this version of gsopt carries none; name one with --prior sd21, a folder or a hub id"
+"""The embedded prior's folder, written by `gsopt finetune`."""
+NO_WEIGHTS = "this copy of gsopt carries no prior; name one with --prior sd21, a folder or a hub id"
+NO_DIFFUSERS = "the embedded prior needs diffusers: pip install 'gsopt[sds]'"
 
 
 @dataclass(frozen=True)
@@ -32,26 +34,46 @@ def choose(config: GuidanceConfig) -> Choice:
     weight = DEFAULT_WEIGHT if config.lambda_sds is None else config.lambda_sds
     if config.prior not in ("auto", "embedded"):
         return Choice(config.prior, weight, "as asked for with --prior")
-    if is_embedded_shipped():
+    missing = what_embedded_lacks()
+    if missing is None:
         return Choice("embedded", weight, "the embedded prior" + (" (default)" if config.prior == "auto" else ""))
-    asked = [
-        flag
-        for flag, given in (
-            ("--prior embedded", config.prior == "embedded"),
-            (f"--lambda_sds {config.lambda_sds}", config.lambda_sds is not None),
-            ("--prompt", config.prompt or config.negative or config.prompts),
-            ("--ref-image", config.ref_image),
-        )
-        if given
-    ]
+    asked = asking(config)
     if asked:
         raise UsageError(
-            f"`{asked[0]}` asks for guidance, but there is {NONE_AT_HAND}. Or drop the flag to learn from the images "
-            "alone."
+            f"`{asked[0]}` asks for guidance, but there is no prior at hand: {missing}. Or drop the flag to learn from "
+            "the images alone."
         )
-    return Choice(None, 0.0, NONE_AT_HAND)
+    return Choice(None, 0.0, f"no prior at hand: {missing}")
 
 
-def is_embedded_shipped() -> bool:
-    """Whether this version of gsopt carries a prior of its own."""
-    return (EMBEDDED / "unet" / "config.json").is_file()
+def asking(config: GuidanceConfig) -> list[str]:
+    """The flags that ask for guidance by the embedded prior."""
+    flags = (
+        ("--prior embedded", config.prior == "embedded"),
+        (f"--lambda_sds {config.lambda_sds}", config.lambda_sds is not None),
+        ("--prompt", config.prompt or config.negative or config.prompts),
+        ("--ref-image", config.ref_image),
+    )
+    return [flag for flag, given in flags if given]
+
+
+def fitting(choice: Choice, config: GuidanceConfig, views: int, enough: int, has_alpha: bool) -> Choice:
+    """The choice for a scene of so many input views. Guidance that nobody asked for is left where it cannot help:
+    `enough` views decide by themselves, and the embedded prior knows objects cut out of their background."""
+    if choice.prior != "embedded" or asking(config):
+        return choice
+    if views >= enough:
+        return Choice(None, 0.0, f"{views} input views decide by themselves; --lambda_sds {DEFAULT_WEIGHT} asks for it")
+    if not has_alpha:
+        why = (
+            "the embedded prior knows objects with alpha or masks, which this scene lacks; --prior embedded asks for it"
+        )
+        return Choice(None, 0.0, why)
+    return choice
+
+
+def what_embedded_lacks() -> str | None:
+    """Why the embedded prior cannot be used here; None where it can."""
+    if not (EMBEDDED / "unet" / "config.json").is_file():
+        return NO_WEIGHTS
+    return None if importlib.util.find_spec("diffusers") else NO_DIFFUSERS

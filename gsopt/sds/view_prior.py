@@ -73,6 +73,7 @@ class ViewPrior:
     def unet(self) -> Any:
         """The network, frozen."""
         diffusers = require("diffusers", "sds", "Guidance by a diffusion prior")
+        diffusers.utils.logging.disable_progress_bar()
         try:
             unet = diffusers.UNet2DConditionModel.from_pretrained(
                 self.folder / "unet", torch_dtype=torch.float32, use_safetensors=True, local_files_only=True

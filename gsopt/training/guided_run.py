@@ -9,7 +9,7 @@ from gsopt.data.scene import Scene
 from gsopt.guidance_config import settled
 from gsopt.init import first_gaussians
 from gsopt.raster.backend import Backend
-from gsopt.sds.choice import choose
+from gsopt.sds.choice import choose, fitting
 from gsopt.sds.coverage import coverage
 from gsopt.sds.guidance import Guide
 from gsopt.sds.opening import open_prior
@@ -27,7 +27,8 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
     """
     recorded = directory.recorded("guidance")
     if recorded is None:
-        choice = choose(config.guidance)
+        few = config.sparse.below_views
+        choice = fitting(choose(config.guidance), config.guidance, len(scene.train), few, scene.has_alpha)
         recorded = {"prior": choice.prior, "lambda_sds": choice.weight, "reason": choice.reason}
         if choice.prior is None:
             directory.record(guidance=recorded)
