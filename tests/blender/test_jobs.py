@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -138,3 +139,21 @@ def test_a_wrong_interpreter_is_told_apart(output: str, said: str) -> None:
     with pytest.raises(InputError) as caught:
         interpreter.read_answer(output, "python")
     assert said in str(caught.value)
+
+
+def test_a_job_outlives_a_killed_blender_and_is_found_again(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parents[2]
+    script = (
+        f"import os, pathlib, sys\nsys.path.insert(0, {str(root)!r})\nfrom blender_addon.core import job\n"
+        f"job.start('train', [sys.executable, '-c', 'import time; time.sleep(60)'], pathlib.Path({str(tmp_path)!r}))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode != 0
+    found = job.read_job(tmp_path)
+    assert job.alive(found)
+    assert job.exit_code(found) is None
+    job.end(found)
+    until = time.monotonic() + 20
+    while job.alive(found):
+        assert time.monotonic() < until
+        time.sleep(0.02)
