@@ -2,7 +2,7 @@
 
 The estimate: begin and end, then per word ceil(letters / 2.5), one per digit, one per byte of all else; a word in other
 than lower or title case counts per letter. Against CLIP's real vocabulary (49,408 tokens) it is never too low on the
-199 phrases of the templates, 1.8 times the truth on average; on 928 phrases of docs/, code and all, it is too low twice.
+199 phrases of the templates, 1.8 times the truth on average; on 928 phrases of docs/, code and all, too low twice.
 tests/llm_prompts/test_clip_vocabulary.py measures that.
 """
 
