@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from gsopt.errors import InputError
 from synth.meshfile import check_mesh, find_near
+from synth.twins import part_twins
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -43,10 +44,21 @@ def stage_mesh(bpy: Any, mesh: Path, normalize: str) -> Staged:
     for other in [o for o in bpy.data.objects if o.type in ("CAMERA", "LIGHT", "LIGHT_PROBE", "SPEAKER")]:
         bpy.data.objects.remove(other)
     warnings += mend_textures(bpy, mesh)
+    if mesh.suffix.lower() == ".obj":
+        cut_out_textures(bpy)
+    turned = wrong = twins = 0
     for shape in bpy.data.meshes:
-        warnings += mend_normals(bpy, shape, mesh.suffix.lower() in UNSHADED)
+        mended = mend_normals(bpy, shape, mesh.suffix.lower() in UNSHADED)
+        turned, wrong = turned + mended.turned, wrong + mended.wrong
+        twins += part_twins(shape)
         if not any(shape.materials):
             shape.materials.append(plain_material(bpy, shape))
+    if turned:
+        warnings.append("faces wound both ways: turned alike, normals computed anew")
+    if wrong:
+        warnings.append(f"normals that pointed away from their face took its own: {wrong}")
+    if twins:
+        warnings.append(f"faces back to back in one plane, parted so that neither shadows the other: {twins}")
     imported = world_triangles(bpy)
     if not len(imported):
         raise InputError(f"{mesh} holds no faces to render. Export the surface, not only points, lines or empties.")
@@ -107,6 +119,26 @@ def mend_textures(bpy: Any, mesh: Path) -> list[str]:
     return sorted(lost)
 
 
+def cut_out_textures(bpy: Any) -> None:
+    """Textures with holes make their surfaces transparent there, as exporters of leaves and lattices mean it: OBJ
+    has `map_d` for that, which they leave out. The other formats say themselves what is transparent."""
+    for tree in [m.node_tree for m in bpy.data.materials if m.node_tree]:
+        for surface in [n for n in tree.nodes if n.type == "BSDF_PRINCIPLED"]:
+            color, alpha = surface.inputs["Base Color"], surface.inputs["Alpha"]
+            texture = color.links[0].from_node if color.is_linked and not alpha.is_linked else None
+            if texture is not None and texture.type == "TEX_IMAGE" and has_holes(texture.image):
+                tree.links.new(texture.outputs["Alpha"], alpha)
+
+
+def has_holes(image: Any) -> bool:
+    """True when some of an image is transparent and some is not; alpha that is 0 all over means nothing."""
+    if image.channels != 4:
+        return False
+    values = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(values)
+    return bool(values[3::4].min() < 0.5 < values[3::4].max())
+
+
 def load_image(bpy: Any, file: Path) -> Any:
     """An image, or None when the file holds none."""
     try:
@@ -116,15 +148,24 @@ def load_image(bpy: Any, file: Path) -> Any:
     return image if image.size[0] else None
 
 
-def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> list[str]:
-    """Normals that would shade black are replaced; what was done, for the record.
+class Mended(NamedTuple):
+    """What was done to the normals of a mesh."""
+
+    turned: bool = False
+    """Faces were turned."""
+    wrong: int = 0
+    """Corners whose normal was replaced."""
+
+
+def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> Mended:
+    """Normals that would shade black are replaced.
 
     Neighbors that wind opposite ways (ShapeNet stores faces from both sides, importers keep one at random) are turned
     alike, and what normals the mesh had are dropped. A corner whose normal points away from its face takes the face's.
     A mesh of a kind without shading of its own and without normals becomes smooth where faces meet gently.
     """
     if not len(shape.polygons):
-        return []
+        return Mended()
     corners = integers(shape.loops, "vertex_index")
     sizes = integers(shape.polygons, "loop_total")
     turned = winding_disagrees(corners, sizes)
@@ -136,17 +177,17 @@ def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> list[str]:
                 bpy.ops.mesh.customdata_custom_splitnormals_clear()
         shape.polygons.foreach_set("use_smooth", np.ones(len(shape.polygons), bool))
         shape.set_sharp_from_angle(angle=SMOOTH_BELOW)
-        return ["faces wound both ways: turned alike, normals computed anew"] if turned else []
+        return Mended(turned)
     if not shape.has_custom_normals:
-        return []
+        return Mended()
     normals = vectors(shape.corner_normals, "vector")
     faces = np.repeat(area_vectors(vectors(shape.vertices, "co")[corners], sizes), sizes, axis=0)
     wrong = ~((normals * faces).sum(axis=1) > 0.0) & faces.any(axis=1)
     if not wrong.any():
-        return []
+        return Mended()
     normals[wrong] = faces[wrong] / np.linalg.norm(faces[wrong], axis=1, keepdims=True)
     shape.normals_split_custom_set(normals.tolist())
-    return [f"{int(wrong.sum())} of {len(wrong)} normals pointed away from their face and took its own"]
+    return Mended(wrong=int(wrong.sum()))
 
 
 def winding_disagrees(corners: Int[np.ndarray, "L"], sizes: Int[np.ndarray, "F"]) -> bool:

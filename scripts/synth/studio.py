@@ -122,7 +122,7 @@ def set_up_renderer(bpy: Any, settings: Settings) -> None:
     cycles = scene.cycles
     cycles.device, cycles.samples = "CPU", settings.samples
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    cycles.max_bounces, cycles.transparent_max_bounces = (0 if settings.lighting == "flat" else 4), 32
+    cycles.max_bounces, cycles.transparent_max_bounces = (0 if settings.lighting == "flat" else 4), 128
     shading = scene.display.shading
     shading.light, shading.color_type = "FLAT", "TEXTURE"
     scene.display.render_aa = "16"
