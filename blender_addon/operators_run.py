@@ -7,11 +7,10 @@ from typing import Any
 
 import bpy
 
-from . import nodes, watching
+from . import watching
 from .core import arguments, job
 from .core import run as runs
 from .core.errors import GsoptError, InputError, UsageError
-from .material import splat_material
 from .operators_guidance import guidance
 from .operators_source import LONG, safe
 from .preferences import absolute, python, work_folder
@@ -49,8 +48,6 @@ class GSOPT_OT_launch(Waiting, bpy.types.Operator):
         data = absolute(settings.photos if settings.source == "PHOTOS" else settings.dataset)
         if not (settings.photos if settings.source == "PHOTOS" else settings.dataset) or not data.exists():
             raise InputError("There is no dataset. Render one, choose a folder, or find the poses of photos.")
-        nodes.node_group(bpy)  # both made now, so that no preview has to wait for them
-        splat_material(bpy)
         work = work_folder(context)
         run = job.free_folder(work / "runs", safe(data))
         folder = job.free_folder(work / "jobs", "train")

@@ -52,6 +52,8 @@ def pick_up() -> None:
     for scene in bpy.data.scenes:
         if scene.gsopt.job_import.state == "RUNNING":
             scene.gsopt.job_import.state = "NONE"
+        if scene.gsopt.run_status in ("waiting", "running"):
+            splat_object.prepare(bpy)
     watch()
 
 
@@ -193,6 +195,7 @@ def attach(scene: Any, run: Path, work: job.Job | None = None, told: int = 0) ->
     settings.run_step = settings.run_total = settings.run_count = 0
     settings.run_psnr = settings.run_eta = -1.0
     _followers[scene.name_full] = runs.Follower(run, work, told)
+    splat_object.prepare(bpy)
     watch()
 
 
