@@ -1,0 +1,74 @@
+"""Seconds of CPU and megabytes that importing takes, a line of JSON per count. For people, not for the test suite.
+
+python tests/blender/measure_import.py FOLDER 10000 100000 1000000      (a Python with the module bpy)
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import bpy  # noqa: E402
+import numpy as np  # noqa: E402
+from made_splats import random_splats  # noqa: E402
+
+from blender_addon import loading, splat_object  # noqa: E402
+from blender_addon.core import statistics  # noqa: E402
+from blender_addon.core.ply import write_ply  # noqa: E402
+
+
+def megabytes() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+
+
+def clocked(work: Callable[[], Any]) -> tuple[Any, float]:
+    began = time.process_time()
+    result = work()
+    return result, round(time.process_time() - began, 4)
+
+
+def measure(path: Path, count: int) -> dict[str, Any]:
+    before = megabytes()
+    splats, read = clocked(lambda: loading.read(path))
+    summary, sums = clocked(lambda: statistics.summary(splats))
+    steps, slices = splat_object.mesh_in_steps(bpy, "measured", splats), []
+    mesh = None
+    while mesh is None:
+        mesh, seconds = clocked(lambda: next(steps))
+        slices.append(seconds)
+    del splats, steps
+    gc.collect()
+    home = bpy.context.scene.collection
+    thing = splat_object.make_object(bpy, home, mesh, summary.median_size, 100_000, "Spheres")
+    _, shown = clocked(bpy.context.view_layer.update)
+    kept, filtered = clocked(
+        lambda: statistics.Filter(opacity=(0.5, 1.0)).keeps(splat_object.read_mesh(mesh, harmonics=False))
+    )
+    found = {"blender": bpy.app.version_string, "splats": count, "read_s": read, "statistics_s": sums}
+    found |= {"mesh_s": round(sum(slices), 4), "longest_slice_s": max(slices), "nodes_100k_s": shown}
+    found |= {"filter_s": filtered, "kept": int(np.count_nonzero(kept)), "more_MB": round(megabytes() - before)}
+    bpy.data.objects.remove(thing)
+    bpy.data.meshes.remove(mesh)
+    return found
+
+
+def main(folder: Path, counts: list[int]) -> None:
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    splat_object.prepare(bpy)
+    for count in counts:
+        path = folder / f"{count}.ply"
+        write_ply(path, random_splats(count))
+        gc.collect()
+        print(json.dumps(measure(path, count)), flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), [int(word) for word in sys.argv[2:]])
