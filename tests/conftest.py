@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,21 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture(autouse=True)
-def no_prior_at_hand(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="session", autouse=True)
+def no_prior_at_hand() -> Iterator[None]:
     """Runs are not guided unless a test says so: most tests are about something else, and the embedded prior takes
-    seconds to load. Tests marked `embedded` meet the package as it ships."""
-    if request.node.get_closest_marker("embedded") is None:
-        monkeypatch.setattr("gsopt.sds.choice.EMBEDDED", ROOT / "no-prior")
+    seconds to load. Only in this process: what starts another says --lambda_sds 0."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsopt.sds.choice.EMBEDDED", ROOT / "no-prior")
+        yield
+
+
+@pytest.fixture
+def embedded(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The prior that ships, at its place."""
+    folder = ROOT / "gsopt" / "sds" / "embedded"
+    monkeypatch.setattr("gsopt.sds.choice.EMBEDDED", folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

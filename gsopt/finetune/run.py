@@ -25,7 +25,7 @@ from gsopt.guidance_config import GuidanceConfig
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.sds.choice import EMBEDDED
-from gsopt.sds.view_prior import ViewPrior, is_view_prior, make_unet
+from gsopt.sds.view_prior import CARD, ViewPrior, is_view_prior, make_unet
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""
@@ -97,6 +97,9 @@ def finetune(
     if (out / STATE).exists():
         training.restore(out / STATE)
         say(f"continuing at step {training.step}")
+    if training.step == course.steps and (out / CARD).exists():
+        recorded: dict[str, Any] = json.loads((out / CARD).read_text("utf-8"))["measured"]
+        return recorded
     training.run(train, out, _Log(out, course, training, val, say))
     unet = training.averaged()
     measured = measure(unet, val) if val else {}

@@ -19,7 +19,7 @@ from gsopt.config import DensityConfig, TrainConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.events import read_events
 
-SMALL = "--iterations 20 --init random --init-count 40 --preview-every 10"
+SMALL = "--lambda_sds 0 --iterations 20 --init random --init-count 40 --preview-every 10"
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
 
 from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds.choice import EMBEDDED, Choice, choose, fitting
+from gsopt.sds.choice import Choice, choose, fitting
 from gsopt.sds.opening import open_prior
 from gsopt.sds.prior import Condition
 from gsopt.sds.view_prior import ViewPrior
@@ -17,28 +18,28 @@ pytest.importorskip("diffusers")
 DEFAULT = Choice("embedded", 0.2, "the embedded prior (default)")
 
 
-def test_the_folder_is_small_and_says_what_it_is() -> None:
-    files = [file for file in EMBEDDED.rglob("*") if file.is_file()]
+def test_the_folder_is_small_and_says_what_it_is(embedded: Path) -> None:
+    files = [file for file in embedded.rglob("*") if file.is_file()]
     assert sum(file.stat().st_size for file in files) < 30e6
     assert max(file.stat().st_size for file in files) < 15e6
-    plan = json.loads((EMBEDDED / "finetune.json").read_text())
-    card = (EMBEDDED / "README.md").read_text()
+    plan = json.loads((embedded / "finetune.json").read_text())
+    card = (embedded / "README.md").read_text()
     for name in plan["train"]:
         assert f"| {name} |" in card
     assert not set(plan["train"]) & set(plan["val"])
-    assert (EMBEDDED / "train.jsonl").read_text().count("\n") > 5
-    measured = json.loads((EMBEDDED / "gsopt_prior.json").read_text())["measured"]
+    assert (embedded / "train.jsonl").read_text().count("\n") > 5
+    measured = json.loads((embedded / "gsopt_prior.json").read_text())["measured"]
     assert max(measured["repair"].values()) > measured["render"]
 
 
-def test_nothing_it_learned_from_is_a_test_object(shared_data) -> None:
+def test_nothing_it_learned_from_is_a_test_object(shared_data: Path, embedded: Path) -> None:
     splits = json.loads((shared_data / "splits.json").read_text())
-    plan = json.loads((EMBEDDED / "finetune.json").read_text())
+    plan = json.loads((embedded / "finetune.json").read_text())
     kept_apart = {name.removeprefix("sh3d/") for part in ("test", "val", "other") for name in splits[part]}
     assert not set(plan["train"]) & kept_apart
 
 
-@pytest.mark.embedded
+@pytest.mark.usefixtures("embedded")
 def test_it_is_the_default_and_answers_the_same_bits_each_time() -> None:
     assert choose(GuidanceConfig()) == DEFAULT
     first, second = (open_prior("embedded", GuidanceConfig()) for _ in range(2))

@@ -118,7 +118,7 @@ def test_a_corrupt_reference_image_stops_before_any_training(dataset: Path, tmp_
         train(config(dataset, ref_image=(str(tmp_path / "ref.png"),)), tmp_path / "run")
 
 
-def test_without_a_prior_nothing_of_diffusion_is_loaded_and_the_reason_is_told(dataset: Path, tmp_path: Path) -> None:
+def test_at_lambda_0_nothing_of_diffusion_is_loaded_and_the_reason_is_told(dataset: Path, tmp_path: Path) -> None:
     import subprocess
 
     script = (
@@ -131,4 +131,4 @@ def test_without_a_prior_nothing_of_diffusion_is_loaded_and_the_reason_is_told(d
     assert done.returncode == 0, done.stderr
     started = read_events(tmp_path / "run" / "events.jsonl")[0][0]
     assert started["guidance"]["prior"] is None
-    assert "no prior at hand" in started["guidance"]["reason"]
+    assert "lambda_sds is 0" in started["guidance"]["reason"]

@@ -13,6 +13,7 @@ from PIL import Image
 from gsopt.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 from gsopt.config import DataConfig, DensityConfig, InitConfig, TrainConfig
 from gsopt.gaussians import Gaussians
+from gsopt.guidance_config import GuidanceConfig
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 
@@ -70,6 +71,7 @@ def tiny_config(dataset: Path, **changes: object) -> TrainConfig:
         "init": InitConfig(method="random", count=60),
         "density": DensityConfig(refine_start=4, refine_every=5, refine_stop=25, grow_grad2d=5e-5, max_gaussians=90),
         "iterations": 30,
+        "guidance": GuidanceConfig(lambda_sds=0.0),
         "backend": "cpu",
         "checkpoint_every": 10,
         "preview_every": 15,
