@@ -38,9 +38,11 @@ def mesh_in_steps(bpy: Any, name: str, splats: Splats) -> Iterator[Any]:
     put(mesh, "position", "FLOAT_VECTOR", splats.positions)
     yield None
     put(mesh, "scale", "FLOAT_VECTOR", splats.scales)
+    yield None
     put(mesh, "rotation", "QUATERNION", splats.rotations)
     yield None
     put(mesh, "radiance:base", "FLOAT_COLOR", np.concatenate([splats.base, splats.opacities[:, None]], axis=1))
+    yield None
     put(mesh, "opacity", "FLOAT", splats.opacities)
     for k in range(splats.sh.shape[1]):
         yield None

@@ -1,4 +1,4 @@
-"""A run's splats drawn by Cycles from a held-out camera, beside gsopt's own picture. For people, not for the test suite.
+"""A run's splats drawn by Cycles from a held-out camera, beside gsopt's own picture. Not a test.
 
     python tests/blender/compare_render.py RUN DATASET VIEW OUT.png [Gaussians|Ellipsoids|Spheres]
 
