@@ -38,6 +38,7 @@ PLY_TYPES = {
     }.items()
     for name in names
 }
+FACE_VERTEX = re.compile(rb"[ \t]-?(\d{1,18})")
 COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
@@ -149,12 +150,11 @@ def check_obj_faces(mesh: Path) -> None:
     """InputError when a face names a vertex that the file does not hold, counted from either end."""
     vertices = reach = 0
     with mesh.open("rb") as file:
-        for words in (line.split() for line in file):
-            if words[:1] == [b"v"]:
+        for line in map(bytes.lstrip, file):
+            if line.startswith((b"v ", b"v\t")):
                 vertices += 1
-            elif words[:1] == [b"f"]:
-                named = (word.partition(b"/")[0].removeprefix(b"-")[:18] for word in words[1:])
-                reach = max(reach, *(int(index) for index in named if index.isdigit()), 0)
+            elif line.startswith((b"f ", b"f\t")):
+                reach = max(reach, *map(int, FACE_VERTEX.findall(line)), 0)
     if reach > vertices:
         raise InputError(
             f"{mesh} has a face at vertex {reach}, but only {vertices} vertices: it is cut short or broken. "
