@@ -95,20 +95,29 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def with_hdri(arguments: Sequence[str]) -> list[str]:
+    """`--lighting hdri FILE`, the one choice that takes a file, as argparse can read it."""
+    words = list(arguments)
+    for at, (flag, choice, file) in enumerate(zip(words, words[1:], words[2:], strict=False)):
+        if (flag, choice) == ("--lighting", "hdri") and not file.startswith("-"):
+            return [*words[: at + 2], "--hdri", *words[at + 2 :]]
+    return words
+
+
 def comma_list(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def pixels(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
+    if not width.isdecimal() or not (height or width).isdecimal():
+        raise argparse.ArgumentTypeError(f"give pixels as 256, or 320x240 for width and height, got {text!r}")
     return int(width), int(height or width)
 
 
 def parse(arguments: Sequence[str]) -> tuple[list[items.Item], Settings, dict[str, Any]]:
     """Items, settings and the other arguments of `library.run` from the command line."""
-    words = list(arguments)
-    if words[-1:] != ["--lighting"] and "hdri" in words and words[words.index("hdri") - 1] == "--lighting":
-        words.insert(words.index("hdri") + 1, "--hdri")  # the one flag whose choice takes a file
+    words = with_hdri(arguments)
     given = vars(make_parser().parse_intermixed_args(words))
     sources = [items.of_paths(given.pop("meshes"))]
     shapenet, synsets, manifest = (given.pop(name) for name in ("shapenet", "synsets", "manifest"))

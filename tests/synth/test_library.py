@@ -248,6 +248,14 @@ def test_command_line_reaches_the_settings(tmp_path: Path) -> None:
     )  # fmt: skip
 
 
+def test_an_environment_wants_its_image() -> None:
+    for line in ("a.obj -o out --lighting hdri", "a.obj --lighting hdri -o out", "--lighting hdri -o out -- a.obj"):
+        with pytest.raises(UsageError, match="needs its image"):
+            synth_views.parse(line.split())
+    words = ["hdri", "--lighting", "hdri", "sky.hdr", "-o", "out"]
+    assert synth_views.parse(words)[1].hdri == "sky.hdr"
+
+
 def test_a_limit_takes_the_first_objects(tmp_path: Path) -> None:
     for name in ("c", "a", "b"):
         (tmp_path / f"{name}.stl").touch()
