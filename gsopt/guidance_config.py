@@ -130,10 +130,12 @@ class GuidanceConfig:
 def settled(config: GuidanceConfig, view_conditioned: bool) -> GuidanceConfig:
     """The same with what was left to gsopt decided, for a prior of that kind."""
     policy = config.policy if config.policy != "auto" else "recon" if view_conditioned else "sds"
-    usual = {
-        "guidance_scale": 1.0 if view_conditioned else 3.0,
-        "every": 2 if policy == "recon" else 10,
-        "denoise_steps": 1 if view_conditioned else 5,
-    }
-    open_ones = {name: value for name, value in usual.items() if getattr(config, name) is None}
-    return replace(config, policy=policy, **open_ones)
+    scale, steps = (1.0, 1) if view_conditioned else (3.0, 5)
+    every = 2 if policy == "recon" else 10
+    return replace(
+        config,
+        policy=policy,
+        guidance_scale=scale if config.guidance_scale is None else config.guidance_scale,
+        every=every if config.every is None else config.every,
+        denoise_steps=steps if config.denoise_steps is None else config.denoise_steps,
+    )

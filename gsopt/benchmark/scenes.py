@@ -11,11 +11,12 @@ from typing import Any
 
 import torch
 
-from gsopt.config import DataConfig, DensityConfig, GuidanceConfig, TrainConfig
+from gsopt.config import DataConfig, DensityConfig, TrainConfig
 from gsopt.errors import UsageError
 from gsopt.evaluation import evaluate_views
 from gsopt.formats import load_splats
 from gsopt.gaussians import Gaussians
+from gsopt.guidance_config import GuidanceConfig
 from gsopt.presets import with_preset
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings

@@ -46,7 +46,7 @@ class Training:
         for group in self.optimizer.param_groups:
             group["lr"] = self.course.rate(self.step)
         self.optimizer.zero_grad(set_to_none=True)
-        found.backward()  # type: ignore[no-untyped-call]
+        found.backward()
         torch.nn.utils.clip_grad_norm_(self.unet.parameters(), 1.0)
         self.optimizer.step()
         self.step += 1
