@@ -90,12 +90,21 @@ def open_folder(out: Path, header: dict[str, Any], resume: bool) -> None:
         occupied = any(out.iterdir())
         if occupied:
             check_same_run(out, header, resume)
-            for partial in list(out.rglob(PARTIAL + "*")):
-                shutil.rmtree(partial)
+            sweep(out)
         else:
             write_whole(out / DATASET, header | {"objects": []})
     except OSError as error:
         raise InputError(f"Cannot use the output folder {out}: {error.strerror}. Choose another -o.") from None
+
+
+def sweep(out: Path, tries: int = 20) -> None:
+    """Remove half-written folders. A worker whose run was just killed may still write: then once more."""
+    for partial in list(out.rglob(PARTIAL + "*")):
+        for _ in range(tries):
+            shutil.rmtree(partial, ignore_errors=True)
+            if not partial.exists():
+                break
+            time.sleep(0.2)
 
 
 def check_same_run(out: Path, header: dict[str, Any], resume: bool) -> None:
