@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from .graph import Graph, Value
-from .nodes import COLOR, CORNER, CUTOFF, INSTANCED
+from .nodes import COLOR, CORNER, INSTANCED
 
 NAME = "gsopt splats"
-VERSION = 1
+VERSION = 2
 LEAST_ALPHA = 1 / 255
 MOST_ALPHA = 0.99
 AS_COLOR, AS_VECTOR, AS_NUMBER, AS_ALPHA = range(4)
 """Outputs of the attribute node; their names changed with Blender 5."""
-DEPTH = 256
-"""Splats behind one another that Cycles looks through; with too few, what lies behind turns black."""
+DEPTH = 1024
+"""Splats behind one another that Cycles looks through, the most it can; with too few, what lies behind turns black."""
 
 
 def splat_material(bpy: Any) -> Any:
@@ -32,13 +32,17 @@ def splat_material(bpy: Any) -> Any:
 
 
 def write(graph: Graph) -> None:
-    """alpha = opacity exp(-r²/2), cut off below 1/255 as gsopt does; r is 0 on anything but a Gaussian's square."""
+    """alpha = o exp(-r²/2), cut off below 1/255 as gsopt does; r is 0 on anything but a Gaussian's square.
+
+    The square reaches to r² = 2 ln(255 o), so that at the place c of its corners' frame alpha = o (255 o)^-|c|².
+    """
     graph.tree.nodes.clear()
     corner = attribute(graph, CORNER, "GEOMETRY", AS_VECTOR)
     instanced = attribute(graph, INSTANCED, "GEOMETRY", AS_NUMBER)
     color = mixed(graph, instanced, AS_COLOR)
     opacity = mixed(graph, instanced, AS_ALPHA)
-    falloff = graph.math("EXPONENT", graph.dot(corner, corner) * (-0.5 * CUTOFF**2))
+    levels = graph.math("MAXIMUM", opacity * 255.0, 1.0)
+    falloff = graph.math("POWER", levels, graph.dot(corner, corner) * -1.0)
     alpha = graph.math("MINIMUM", opacity * falloff, MOST_ALPHA)
     visible = alpha * graph.math("GREATER_THAN", alpha, LEAST_ALPHA)
     light = graph.call("ShaderNodeEmission", {"Color": color, "Strength": 1.0})
@@ -72,5 +76,5 @@ def let_cycles_see_through(scene: Any) -> None:
     and transparency alone then give a picture without noise."""
     cycles = getattr(scene, "cycles", None)
     if cycles is not None:
-        cycles.transparent_max_bounces = max(DEPTH, cycles.transparent_max_bounces)
-        cycles.min_transparent_bounces = max(DEPTH // 2, cycles.min_transparent_bounces)
+        cycles.transparent_max_bounces = DEPTH
+        cycles.min_transparent_bounces = DEPTH

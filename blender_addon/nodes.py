@@ -2,8 +2,8 @@
 camera-facing Gaussians.
 
 A Gaussian seen from direction d covers, in the plane across d, an ellipse with the covariance P Σ P, P = 1 - d dᵀ: that
-is what gsopt's image model draws, to first order. Its principal axes carry a square on which the material paints
-exp(-r²/2).
+is what gsopt's image model draws, to first order. Its principal axes carry a square, as large as the Gaussian of this
+opacity o is visible: exp(-r²/2) o falls to 1/255 at r² = 2 ln(255 o). The material paints it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from typing import Any
 from .graph import Graph, Value
 
 GROUP = "gsopt splats"
-VERSION = 1
+VERSION = 2
 DISPLAYS = ("Points", "Spheres", "Ellipsoids", "Gaussians")
-CUTOFF = 3.33
-"""Standard deviations at which a Gaussian of opacity 1 falls below 1/255."""
 COLOR, CORNER, INSTANCED, HIDDEN = "gsopt_color", "gsopt_corner", "gsopt_instanced", "gsopt_hidden"
 
 C0 = math.sqrt(1 / math.pi) / 2
@@ -235,8 +233,10 @@ def footprint(
     angle = graph.math("ARCTAN2", b, half) * 0.5
     long = along(graph, u, graph.math("COSINE", angle)) + along(graph, v, graph.math("SINE", angle))
     turn = graph.call("FunctionNodeAxesToRotation", [d, long], primary_axis="Z", secondary_axis="X")
-    most = graph.math("SQRT", graph.math("MAXIMUM", middle + spread, 0.0)) * CUTOFF
-    least = graph.math("SQRT", graph.math("MAXIMUM", middle - spread, 0.0)) * CUTOFF
+    levels = graph.math("MAXIMUM", graph.attribute("opacity", "FLOAT") * 255.0, 1.0)
+    reach2 = graph.math("LOGARITHM", levels, math.e) * 2.0
+    most = graph.math("SQRT", graph.math("MAXIMUM", middle + spread, 0.0) * reach2)
+    least = graph.math("SQRT", graph.math("MAXIMUM", middle - spread, 0.0) * reach2)
     return turn, graph.join(most, least, 1.0)
 
 

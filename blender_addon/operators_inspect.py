@@ -109,12 +109,12 @@ def settings_of(scene: str) -> Any:
 
 
 def activate(thing: Any) -> None:
+    """Make it the active object, not a selected one: the outlines of thousands of splats would hide their colors."""
     layer = bpy.context.view_layer
     layer.update()
     if thing.name in layer.objects:
-        for other in layer.objects.selected:
+        for other in list(layer.objects.selected):
             other.select_set(False)
-        thing.select_set(True)
         layer.objects.active = thing
 
 

@@ -322,13 +322,13 @@ def draw_summary(layout: Any, thing: Any) -> None:
         return
     box.label(text=f"{found.count:,} splats, {found.outliers:,} outliers")
     row = box.row()
-    for title, bars in (("Opacity", found.opacities), ("Size", found.sizes)):
+    for title, bars in (("Opacity from", found.opacities), ("Size from", found.sizes)):
         column = row.column(align=True)
-        column.scale_y = 0.6
+        column.scale_y = 0.75
         column.label(text=title)
         most = max(bar.count for bar in bars)
         for bar in bars:
-            column.progress(factor=bar.count / most, text=f"{bar.low:.2g} - {bar.high:.2g}: {bar.count:,}")
+            column.progress(factor=bar.count / most, text=f"{bar.low:.2g}:  {bar.count:,}")
 
 
 def draw_filters(layout: Any, settings: Any) -> None:

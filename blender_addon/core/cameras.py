@@ -103,7 +103,7 @@ def find_image(folder: Path, name: str) -> Path:
 def from_colmap(data: Path, sparse: Path) -> list[View]:
     views = []
     for picture in colmap.read_pictures(sparse):
-        world_from_cv = np.linalg.inv(picture.cam_from_world)
+        world_from_cv = np.linalg.inv(picture.cam_from_world).astype(np.float64)
         angle = 2 * math.atan(0.5 * picture.width / picture.focal)
         image = data / "images" / picture.name
         size = picture.width, picture.height

@@ -62,7 +62,7 @@ def scene_from_dataset(data: Path) -> NDArray[np.float64] | None:
         forward = np.array(matrix, np.float64)
         if forward.shape != (4, 4) or not all(math.isfinite(value) for value in forward.flat):
             raise ValueError("it is no 4x4 matrix")
-        return np.linalg.inv(forward)
+        return np.linalg.inv(forward).astype(np.float64)
     except (ValueError, TypeError, np.linalg.LinAlgError) as error:
         raise InputError(
             f"`normalized_from_mesh` of {data / RECORD} cannot be used: {error}. Render it again."

@@ -146,7 +146,7 @@ def copy_columns(block: NDArray[np.void], names: tuple[str, ...], out: NDArray[n
     """Columns of a structured block into a matrix; a file of float32 alone is copied as one slice."""
     row = block.dtype
     places = [(row.names or ()).index(name) for name in names]
-    plain = all(row[i] == row[0] and row[i].itemsize == 4 and row[i].kind == "f" for i in range(len(row)))
+    plain = all(row[i] == row[0] and row[i].itemsize == 4 and row[i].kind == "f" for i in range(len(row.names or ())))
     if plain and places and places == list(range(places[0], places[0] + len(places))):
         out[...] = block.view(row[0]).reshape(len(block), -1)[:, places[0] : places[0] + len(places)]
         return

@@ -54,7 +54,8 @@ class Splats:
     @property
     def colors(self) -> Floats:
         """[N, 3] sRGB-coded base colors, 0 to 1."""
-        return np.clip(0.5 + np.float32(C0) * self.base, 0, 1)
+        colors: Floats = np.clip(0.5 + np.float32(C0) * self.base, 0, 1)
+        return colors
 
     def rows(self, chosen: Any) -> Splats:
         """Those rows: a mask, numbers or a slice."""

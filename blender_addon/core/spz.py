@@ -88,11 +88,11 @@ class Unpacker:
             p = np.clip(alphas / np.float32(255), 0.25 / 255, 1 - 0.25 / 255)
         found = from_file_values(
             fixed_point(points.reshape(count, 3, 3), fraction),
-            scales.reshape(count, 3).astype(np.float32) / 16 - 10,
+            scales.reshape(count, 3).astype(np.float32) / np.float32(16) - np.float32(10),
             first_three(rotations) if version == 2 else smallest_three(rotations),
             np.log(p / (1 - p)).astype(np.float32),
-            ((colors.astype(np.float32) / 255 - 0.5) / np.float32(0.15)).reshape(count, 3),
-            ((rest.astype(np.float32) - 128) / 128).reshape(count, bands, 3),
+            ((colors.astype(np.float32) / np.float32(255) - np.float32(0.5)) / np.float32(0.15)).reshape(count, 3),
+            ((rest.astype(np.float32) - np.float32(128)) / np.float32(128)).reshape(count, bands, 3),
             self.path,
         )
         return turned(found, RIGHT_UP_BACK)

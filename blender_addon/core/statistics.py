@@ -43,7 +43,8 @@ class Summary:
 
 def sizes(splats: Splats) -> NDArray[np.float32]:
     """[N] geometric mean of the three scales."""
-    return np.cbrt(splats.scales.prod(axis=1, dtype=np.float64)).astype(np.float32)
+    size: NDArray[np.float32] = np.cbrt(splats.scales.prod(axis=1, dtype=np.float64)).astype(np.float32)
+    return size
 
 
 def outliers(splats: Splats) -> NDArray[np.bool_]:
@@ -52,7 +53,7 @@ def outliers(splats: Splats) -> NDArray[np.bool_]:
         return np.zeros(0, bool)
     distance = np.linalg.norm(splats.positions - np.median(splats.positions, axis=0), axis=1)
     largest = splats.scales.max(axis=1)
-    far = distance > FAR * max(float(np.median(distance)), 1e-12)
+    far: NDArray[np.bool_] = distance > FAR * max(float(np.median(distance)), 1e-12)
     return far | (largest > LARGE * max(float(np.median(largest)), 1e-12))
 
 

@@ -85,11 +85,14 @@ def scroll(pages: int) -> None:
 def frame_selected() -> None:
     window, area, _, _ = view()
     region = next(r for r in area.regions if r.type == "WINDOW")
+    active = bpy.context.view_layer.objects.active
+    active.select_set(True)
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.view3d.view_axis(type="FRONT")
         bpy.ops.view3d.view_orbit(angle=0.5, type="ORBITRIGHT")
         bpy.ops.view3d.view_orbit(angle=0.35, type="ORBITUP")
         bpy.ops.view3d.view_selected()
+    active.select_set(False)
 
 
 def fill_guidance() -> None:
