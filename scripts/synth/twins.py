@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 GAP = 1e-4
-"""How far each side moves outward, share of the mesh's extent: a fiftieth of a pixel when it fills 256 pixels."""
+"""How far each side moves outward, share of the mesh's extent: a fortieth of a pixel when it fills 256 pixels."""
 TOUCH = 1e-5
 """Sides closer than this, in the same measure, lie in one plane."""
 OPPOSITE = -0.999
