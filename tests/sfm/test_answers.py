@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gsopt.data.sfm import diagnosis
 from gsopt.data.sfm.features import ViewGraph, choose_matching, neighbors_in_time
-from gsopt.data.sfm.mapping import mappers_to_try
+from gsopt.data.sfm.mapping import mappers_to_try, seed_photos
 from gsopt.data.sfm.photos import Photo, Refused
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
@@ -137,6 +137,15 @@ def test_what_auto_becomes() -> None:
     assert mappers_to_try(auto, 300) == ["incremental", "hybrid"]
     assert mappers_to_try(auto, 301) == ["hybrid", "incremental"]
     assert mappers_to_try(replace(auto, mapper="global"), 10) == ["global"]
+
+
+def test_the_seed_is_the_best_connected_photos_and_leaves_pairs_without_depth_out() -> None:
+    pairs = {(0, 1): 900, (1, 2): 400, (2, 3): 300, (4, 5): 800, (0, 5): 10}
+    names = list(NAMES)
+    assert sorted(seed_photos(graph(pairs, still=((0, 1),)), 2)) == names[4:]
+    assert seed_photos(graph(pairs), 4) == [names[0], names[1], names[2], names[3]]
+    assert set(seed_photos(graph(pairs), 16)) == set(names)
+    assert seed_photos(graph({}), 3) == names[:3]
 
 
 def test_neighbors_in_time_reach_over_short_gaps_and_far_ahead() -> None:

@@ -86,6 +86,15 @@ def test_the_other_mappers_find_the_same_poses(room_photos: Path, tmp_path: Path
     assert error.rotation_degrees.max() < ROTATION
 
 
+def test_global_mapping_finds_the_lens_where_exif_tells_none(tmp_path: Path) -> None:
+    room.photograph(tmp_path / "photos", room.arc(8), exif=False)
+    posed = pose_photos(tmp_path / "photos", tmp_path / "scene", replace(QUICK, mapper="global"))
+    assert len(posed.diagnosis.registered) == 8
+    frames = read_colmap(posed.path).frames
+    assert compare(viewmats(frames), room.arc(8).numpy()).rotation_degrees.max() < 2 * ROTATION
+    assert abs(float(frames[0].K[0, 0]) / room.FOCAL - 1) < 0.05
+
+
 def test_photos_stored_sideways_and_in_other_sizes_find_their_place(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     names = room.photograph(photos, room.arc(6))
