@@ -54,7 +54,8 @@ def outliers(splats: Splats) -> NDArray[np.bool_]:
     distance = np.linalg.norm(splats.positions - np.median(splats.positions, axis=0), axis=1)
     largest = splats.scales.max(axis=1)
     far: NDArray[np.bool_] = distance > FAR * max(float(np.median(distance)), 1e-12)
-    return far | (largest > LARGE * max(float(np.median(largest)), 1e-12))
+    large: NDArray[np.bool_] = largest > LARGE * max(float(np.median(largest)), 1e-12)
+    return far | large
 
 
 def summary(splats: Splats) -> Summary:
