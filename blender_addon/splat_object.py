@@ -29,24 +29,29 @@ def is_splats(thing: Any) -> bool:
     return bool(thing is not None and thing.type == "MESH" and thing.data.get(MARK))
 
 
-def mesh_in_steps(bpy: Any, name: str, splats: Splats) -> Iterator[Any]:
+Part = tuple[str, str, Any]
+"""Name, type and flat values of an attribute."""
+
+
+def parts_of(splats: Splats) -> list[Part]:
+    """All attributes as Blender takes them; plain numpy, so that a thread can make them."""
+    base = np.concatenate([splats.base, splats.opacities[:, None]], axis=1)
+    parts = [("position", "FLOAT_VECTOR", splats.positions), ("scale", "FLOAT_VECTOR", splats.scales)]
+    parts += [("rotation", "QUATERNION", splats.rotations), ("radiance:base", "FLOAT_COLOR", base)]
+    parts += [("opacity", "FLOAT", splats.opacities)]
+    parts += [(f"radiance:sh_{k}", "FLOAT_VECTOR", splats.sh[:, k]) for k in range(splats.sh.shape[1])]
+    return [(name, kind, np.ascontiguousarray(values, np.float32).reshape(-1)) for name, kind, values in parts]
+
+
+def mesh_in_steps(bpy: Any, name: str, parts: list[Part]) -> Iterator[Any]:
     """A mesh made bit by bit: None after every attribute, so that a timer can pause in between, then the mesh."""
     mesh = bpy.data.meshes.new(name)
     mesh[MARK] = 1
-    mesh.vertices.add(len(splats))
+    mesh.vertices.add(len(parts[0][2]) // 3)
     yield None
-    put(mesh, "position", "FLOAT_VECTOR", splats.positions)
-    yield None
-    put(mesh, "scale", "FLOAT_VECTOR", splats.scales)
-    yield None
-    put(mesh, "rotation", "QUATERNION", splats.rotations)
-    yield None
-    put(mesh, "radiance:base", "FLOAT_COLOR", np.concatenate([splats.base, splats.opacities[:, None]], axis=1))
-    yield None
-    put(mesh, "opacity", "FLOAT", splats.opacities)
-    for k in range(splats.sh.shape[1]):
+    for part in parts:
+        put(mesh, *part)
         yield None
-        put(mesh, f"radiance:sh_{k}", "FLOAT_VECTOR", splats.sh[:, k])
     mesh.materials.append(splat_material(bpy))
     mesh.update_tag()
     yield mesh
@@ -54,7 +59,7 @@ def mesh_in_steps(bpy: Any, name: str, splats: Splats) -> Iterator[Any]:
 
 def make_mesh(bpy: Any, name: str, splats: Splats) -> Any:
     """The mesh at once."""
-    return next(step for step in mesh_in_steps(bpy, name, splats) if step is not None)
+    return next(step for step in mesh_in_steps(bpy, name, parts_of(splats)) if step is not None)
 
 
 KEYS = {"FLOAT": "value", "QUATERNION": "value", "BOOLEAN": "value", "FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color"}
