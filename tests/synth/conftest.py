@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,22 @@ from tiny_meshes import CENTERS, CUBE, RADIUS, TEXTURE_RGB, ball
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "scripts"), str(ROOT)]  # as synth_views.py does: bpy's Pythons need no gsopt installed
+
+
+EXIT_STATUS = pytest.StashKey[int]()
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    session.config.stash[EXIT_STATUS] = int(exitstatus)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Leave without Python's farewell: bpy 4.5 sometimes waits there forever for a thread of its own."""
+    loaded = sys.modules.get("bpy")
+    if loaded is not None and loaded.app.version[:2] == (4, 5) and not hasattr(config, "workerinput"):
+        sys.stdout.flush()
+        os._exit(config.stash.get(EXIT_STATUS, 0))
 
 
 @pytest.fixture(scope="session")
