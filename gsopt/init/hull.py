@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsopt.cameras import Cameras
 from gsopt.data.scene import Scene
 from gsopt.init.photos import Photo, colors_from_sums, sample, small_photos
 from gsopt.init.rig import Focus, find_focus, inside, project
@@ -104,9 +105,11 @@ def _carved(
 
 
 def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0.0) -> Bool[Tensor, "N"]:
-    """True where every photo that shows a point shows it solid, and at least half of the photos show it.
+    """True where every photo that shows a point shows it solid, and at least half of the photos show it. A photo with
+    all of the object in it must show the point: without that, few views leave a second hull beside the first, in what
+    only two of them see (4 views of a stone lantern: 21.6 dB instead of 23.5).
 
-    With a `radius` (scene units) a point counts as solid when anything within it may be.
+    With a `radius` (scene units) a point counts as solid, and as shown, when anything within it may be.
     """
     alive, here = torch.arange(len(points)), points
     shown = torch.zeros(len(points), dtype=torch.int32)
@@ -114,13 +117,25 @@ def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0
         column, row, depth = project(photo.camera, here)
         visible = inside(photo.camera, column, row, depth)
         alpha = _widened(photo, radius, depth[visible]) if radius else photo.alpha()
+        passed = ~visible
+        if photo.shows_all():
+            passed &= _near(photo.camera, column, row, depth, radius)
         column, row = (torch.where(visible, coordinate, 0.0) for coordinate in (column, row))  # no NaN to sample at
-        rows = torch.nonzero((sample(alpha, column, row)[0] > _SOLID) | ~visible)[:, 0]
+        rows = torch.nonzero((visible & (sample(alpha, column, row)[0] > _SOLID)) | passed)[:, 0]
         alive, here = alive.index_select(0, rows), here.index_select(0, rows)
         shown = shown.index_select(0, rows) + visible.index_select(0, rows)
     kept = torch.zeros(len(points), dtype=torch.bool)
     kept[alive] = 2 * shown >= len(photos)
     return kept
+
+
+def _near(camera: Cameras, column: Tensor, row: Tensor, depth: Tensor, radius: float) -> Bool[Tensor, "N"]:
+    """Whether a ball of this radius around a point may reach into the image; never for a radius of 0."""
+    if radius == 0:
+        return torch.zeros(len(column), dtype=torch.bool)
+    reach = radius * float(camera.Ks[0].diagonal()[:2].max()) / (depth - radius).clamp_min(1e-12)
+    across = (column > -reach) & (column < camera.width + reach)
+    return (depth <= radius) | (across & (row > -reach) & (row < camera.height + reach))
 
 
 def _widened(photo: Photo, radius: float, depths: Float[Tensor, "M"]) -> Float[Tensor, "1 H W"]:

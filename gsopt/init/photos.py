@@ -31,6 +31,11 @@ class Photo:
         """0..1."""
         return self.planes[3:].float() / 255
 
+    def shows_all(self) -> bool:
+        """Whether the silhouette keeps off the border: what lies outside the picture is then no part of the object."""
+        alpha = self.planes[3]
+        return not any(bool((edge > 127).any()) for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
+
 
 def small_photos(views: Sequence[View], most: int) -> list[Photo]:
     """Copies of up to `most` views, those farthest apart when there are more, in the order of `views`."""
