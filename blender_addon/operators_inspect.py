@@ -162,7 +162,7 @@ def add_camera(home: Any, view: View, matrix: Matrix, alpha: float) -> Any:
     if view.image.is_file():
         picture = lens.background_images.new()
         picture.image = bpy.data.images.load(str(view.image), check_existing=True)
-        picture.alpha = alpha
+        picture.alpha, picture.display_depth = alpha, "FRONT"
         lens.show_background_images = True
     return camera
 
