@@ -82,9 +82,7 @@ class PoseRefinement:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Inverse of `tensors`."""
         for name, own in self.tensors().items():
-            if tensors[name].shape != own.shape:
-                raise ValueError(f"the shape of poses.{name}")
-            own.copy_(tensors[name])
+            own.copy_(_of_shape(tensors[name], own, name))
 
     def moved(self) -> tuple[Float[Tensor, "C"], Float[Tensor, "C"]]:
         """How far each view went from where it was given: degrees, scene units."""
@@ -181,3 +179,10 @@ def rigid_motion(xi: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
 
 def _centers(viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "C 3"]:
     return -torch.einsum("cij,ci->cj", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def _of_shape(found: Tensor, own: Tensor, name: str) -> Tensor:
+    """For `Trainer.resumed`, which turns this into an InputError that names the checkpoint."""
+    if found.shape != own.shape:
+        raise ValueError(f"the shape of poses.{name}")
+    return found
