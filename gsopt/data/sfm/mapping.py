@@ -221,7 +221,8 @@ def seed_photos(graph: ViewGraph, most: int) -> list[str]:
     matches = {pair: count for pair, count in graph.inliers.items() if pair not in graph.still}
     if not matches:
         return sorted(graph.features)[:most]
-    chosen = list(max(matches, key=lambda pair: (matches[pair], pair)))
+    best, _ = max(matches.items(), key=lambda item: (item[1], item[0]))
+    chosen = list(best)
     while len(chosen) < most:
         sums: Counter[str] = Counter()
         for (a, b), count in matches.items():
