@@ -71,6 +71,7 @@ def test_half_a_line_waits_for_its_rest(tmp_path: Path) -> None:
         line("preview", 5, path="../../etc/passwd"),
         line("preview", 5, path=["x"]),
     ],
+    ids=range(13),  # the lines tell the time: as names they would differ from process to process
 )
 def test_garbage_is_skipped(tmp_path: Path, garbage: bytes) -> None:
     append(tmp_path, STARTED + garbage + line("progress", 9, step=3, total=100, n=6))
