@@ -139,9 +139,7 @@ def test_gsopt_prompts_takes_the_flags(tmp_path: Path) -> None:
 
 def test_synth_views_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
-    from conftest import ROOT
-
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "scripts"))
     import synth_views
 
     rendering = arguments.Rendering(views=3, test_views=1, resolution=32, masks=True)
