@@ -4,7 +4,7 @@
 #     scripts/train_embedded_prior.sh BLENDER_PYTHON MESHES SPLITS OUT
 #
 # BLENDER_PYTHON has bpy; MESHES holds MANIFEST.json and the meshes it lists; SPLITS is a JSON file with the names under
-# `train` and `val`. About two CPU hours. Interrupted, the same command goes on.
+# `train` and `val`. Interrupted, the same command goes on.
 set -eu
 blender_python=$1 meshes=$2 splits=$3 out=$4
 mkdir -p "$out"

@@ -32,9 +32,11 @@ class Photo:
         return self.planes[3:].float() / 255
 
     def shows_all(self) -> bool:
-        """Whether the silhouette keeps off the border: what lies outside the picture is then no part of the object."""
-        alpha = self.planes[3]
-        return not any(bool((edge > 127).any()) for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
+        """Whether there is a silhouette and it keeps off the border: what lies outside the picture is then no part of
+        the object."""
+        solid = self.planes[3] > 127
+        touches = any(bool(edge.any()) for edge in (solid[0], solid[-1], solid[:, 0], solid[:, -1]))
+        return bool(solid.any()) and not touches
 
 
 def small_photos(views: Sequence[View], most: int) -> list[Photo]:

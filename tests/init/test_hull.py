@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from shapes import BLUE, RED, ellipsoid_scene, spread_cameras
 
+from gsopt.cameras import Cameras
 from gsopt.config import InitConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import UsageError
 from gsopt.init import first_gaussians
 from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
-from gsopt.init.photos import small_photos
-from gsopt.init.rig import find_focus
+from gsopt.init.photos import Photo, small_photos
+from gsopt.init.rig import find_focus, sees
 
 CENTER, RADII = (0.3, -0.2, 0.1), (0.9, 0.6, 0.4)
 
@@ -146,3 +148,57 @@ def test_silhouettes_that_outline_nothing_fall_back_or_say_so(tmp_path: Path, al
     assert "random" in said
     with pytest.raises(UsageError, match=r"--init\.method hull"):
         first_gaussians(scene, InitConfig(method="hull", count=50), 0, 0)
+
+
+def slid(photo: Photo, columns: int) -> Photo:
+    """The same picture slid to the right, camera and all; what leaves it is cut off."""
+    K = photo.camera.Ks.clone()
+    K[:, 0, 2] += columns
+    planes = torch.zeros_like(photo.planes)
+    planes[..., columns:] = photo.planes[..., :-columns]
+    return Photo(replace(photo.camera, Ks=K), planes)
+
+
+def beside(camera: Cameras, columns: float) -> torch.Tensor:
+    """A point as far away as the object, so many pixels to the right of the picture's middle."""
+    depth = float((torch.tensor(CENTER) - camera.centers[0]) @ camera.forwards[0])
+    aside = camera.viewmats[0, 0, :3] * columns * depth / float(camera.Ks[0, 0, 0])
+    return (camera.centers[0] + camera.forwards[0] * depth + aside)[None].float()
+
+
+def test_what_a_photo_with_the_whole_object_does_not_show_is_no_part_of_it(scene: Scene) -> None:
+    """Though every other photo has the point solid. A photo without a silhouette says nothing beyond its edge."""
+    whole, *more = small_photos(scene.train, 100)
+    point = beside(whole.camera, 0.75 * whole.camera.width)
+    full = torch.full_like(whole.planes, 255)
+    others = [Photo(photo.camera, full) for photo in more if bool(sees(photo.camera, point)[0])]
+    assert len(others) > 2
+    assert not bool(in_hull([whole, *others], point)[0])
+    assert bool(in_hull([Photo(whole.camera, torch.zeros_like(full)), *others], point)[0])
+
+
+def test_an_object_that_its_photo_cuts_off_goes_on_beyond_the_edge(scene: Scene) -> None:
+    whole, *others = small_photos(scene.train, 100)
+    cut = slid(whole, whole.camera.width // 2)
+    directions = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    inner = directions * torch.tensor(RADII) * 0.93 + torch.tensor(CENTER)
+    assert not bool(sees(cut.camera, inner).all())
+    assert bool(in_hull([cut, *others], inner).all())
+
+
+def test_a_ball_that_may_reach_into_the_picture_is_not_carved(scene: Scene) -> None:
+    """Whose centre lies just outside the whole object's photo; one far outside is, and so is every point."""
+    whole, *more = small_photos(scene.train, 100)
+    half = whole.camera.width / 2
+    near, far = beside(whole.camera, half + 1), beside(whole.camera, 4 * half)
+    pixel = float((beside(whole.camera, 1) - beside(whole.camera, 0)).norm())
+    full = Photo(whole.camera, torch.full_like(whole.planes, 255))
+    edge = full.planes.clone()
+    edge[3, :, 0] = edge[3, :, -1] = edge[3, 0] = edge[3, -1] = 0
+    solid = Photo(whole.camera, edge)
+    assert solid.shows_all()
+    assert bool(in_hull([solid], beside(whole.camera, 0), 3 * pixel)[0])
+    others = [Photo(photo.camera, full.planes) for photo in more if bool(sees(photo.camera, near)[0])][:3]
+    assert bool(in_hull([solid, *others], near, 3 * pixel)[0])
+    assert not bool(in_hull([solid, *others], near)[0])
+    assert not bool(in_hull([solid, *others], far, 3 * pixel)[0])
