@@ -43,7 +43,7 @@ def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespac
     """One run and what it came to."""
     shutil.rmtree(folder, ignore_errors=True)
     flags = ["--views", str(views), "--seed", str(seed), "--iterations", str(options.iterations), "--threads", "1"]
-    flags += ["--checkpoint-every", "0", "--preview-every", "0", *ARMS[arm], *options.flag]
+    flags += ["--checkpoint-every", "0", "--preview-every", "0", *ARMS[arm]]
     if arm != "off" and options.prior:
         flags += ["--prior", options.prior]
     began = time.process_time()
@@ -110,7 +110,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--prior", default="")
     parser.add_argument("--iterations", type=int, default=2000)
-    parser.add_argument("--flag", nargs="*", default=[], help="further flags of gsopt train, without their dashes=")
     parser.add_argument("--runs", type=Path, default=Path("runs/guidance"))
     parser.add_argument("--draw", action="store_true")
     options = parser.parse_args()

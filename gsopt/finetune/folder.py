@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from gsopt.data.files import is_regular
+from gsopt.data.files import is_regular, read_json
 from gsopt.events import to_json, write_atomic
 from gsopt.finetune.course import Course
 from gsopt.sds.view_prior import CARD, STEPS
@@ -25,10 +25,8 @@ READABLE = 0o644
 def write_folder(
     out: Path, unet: Any, lessons: Lessons, course: Course, base: Path | None, measured: Mapping[str, Any]
 ) -> None:
-    """unet/ in half precision, the noise schedule, gsopt_prior.json and the model card."""
-    own = {name: value.clone() for name, value in unet.state_dict().items()}
+    """unet/ in half precision (`unet` too, afterwards), the noise schedule, gsopt_prior.json and the model card."""
     unet.half().save_pretrained(out / "unet", max_shard_size=LARGEST_SHARD, safe_serialization=True)
-    unet.float().load_state_dict(own)
     for file in (out / "unet").iterdir():
         file.chmod(READABLE)  # diffusers writes weights that only their owner may read
     write_atomic(out / CARD, to_json({"size": lessons.size, "measured": dict(measured)}))
@@ -51,7 +49,7 @@ def _origin(scene: Path) -> dict[str, str]:
     """Name, category, creator and licence of a scene, as far as the renderer of a mesh wrote them beside it."""
     known: dict[str, Any] = {}
     if is_regular(scene / "object.json"):
-        known = json.loads((scene / "object.json").read_text("utf-8"))
+        known = read_json(scene / "object.json")
     text = {key: str(known.get(key) or "not stated").splitlines()[0][:80] for key in ("category", "creator", "license")}
     return {"name": scene.name, **text}
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from gsopt import check
-from gsopt.data.files import is_regular
+from gsopt.data.files import is_regular, read_json
 from gsopt.data.scene import is_posed
 from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
@@ -54,7 +54,10 @@ class Lessons:
 
 def find_scenes(roots: Sequence[Path], val: Sequence[str]) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """Posed scenes among and below `roots`, by name; those called `val` apart (none given: every tenth)."""
-    found = {p.name: p for root in roots for p in (root, *sorted(root.iterdir() if root.is_dir() else ())) if _is(p)}
+    found: dict[str, Path] = {}
+    for path in (p for root in roots for p in (root, *sorted(root.iterdir() if root.is_dir() else ())) if _is(p)):
+        if found.setdefault(path.name, path) != path:
+            raise UsageError(f"{found[path.name]} and {path} have the same name. Rename one, or give only one of them.")
     unknown = [name for name in val if name not in found]
     if unknown:
         raise UsageError(f"`--val` names {unknown[0]!r}, which is none of the {len(found)} scenes found. Correct it.")
@@ -98,8 +101,7 @@ def finetune(
         training.restore(out / STATE)
         say(f"continuing at step {training.step}")
     if training.step == course.steps and (out / CARD).exists():
-        recorded: dict[str, Any] = json.loads((out / CARD).read_text("utf-8"))["measured"]
-        return recorded
+        return dict(read_json(out / CARD).get("measured") or {})
     training.run(train, out, _Log(out, course, training, val, say))
     unet = training.averaged()
     measured = measure(unet, val) if val else {}
@@ -140,7 +142,7 @@ def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> No
         "base": None if base is None else base.name,
     }
     if path.exists():
-        if json.loads(path.read_text("utf-8")) != plan:
+        if read_json(path) != json.loads(to_json(plan)):
             raise InputError(f"{out} belongs to a training with other scenes or flags. Repeat them or give another -o.")
         return
     if out.exists() and any(entry.name != "pairs" for entry in out.iterdir()):

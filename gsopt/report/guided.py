@@ -11,7 +11,7 @@ from PIL import Image
 
 from gsopt.data.files import is_regular, read_json
 from gsopt.errors import InputError
-from gsopt.report.pictures import data_uri, shrunk
+from gsopt.report.pictures import data_uri, read_picture
 
 SIDE = 256
 MOST = 8
@@ -19,6 +19,9 @@ MOST = 8
 LARGEST = 2048 * 2048
 BEFORE_AFTER = ("before", "before_uncertainty", "after", "after_uncertainty")
 PROPOSAL = ("render", "proposal", "uncertainty")
+
+Row = tuple[str, list[Image.Image | None]]
+"""A line of text and the pictures above it."""
 
 
 def section(run: Path, messages: list[str]) -> str:
@@ -31,7 +34,7 @@ def section(run: Path, messages: list[str]) -> str:
     except InputError as error:
         messages.append(f"What guidance did cannot be shown. {error}")
         return ""
-    views = [_row(folder, [_view_file(kind, view) for kind in BEFORE_AFTER]) for view in _numbers(told.get("views"))]
+    views = [_view(folder, view) for view in _numbers(told.get("views"))]
     steps = [_step(folder, sample) for sample in _objects(told.get("samples"))]
     return (
         f"<section><h2>Guidance</h2><p>{escape(counts(told))}</p>"
@@ -58,34 +61,23 @@ def counts(told: dict[str, Any]) -> str:
     return " ".join(sentences)
 
 
-def _view_file(kind: str, view: int) -> str:
-    when, _, what = kind.partition("_")
-    return f"{when}_{view:02d}" + (f"_{what}" if what else "")
+def _view(folder: Path, view: int) -> Row:
+    files = (f"{when}_{view:02d}{what}" for when in ("before", "after") for what in ("", "_uncertainty"))
+    return "", _pictures(folder, files)
 
 
-def _step(folder: Path, sample: dict[str, Any]) -> tuple[str, list[Image.Image | None]]:
+def _step(folder: Path, sample: dict[str, Any]) -> Row:
     step = _whole(sample.get("step"))
     text = str(sample.get("text") or "")[:200]
-    _, pictures = _row(folder, [f"step_{step:06d}_{kind}" for kind in PROPOSAL])
+    pictures = _pictures(folder, (f"step_{step:06d}_{kind}" for kind in PROPOSAL))
     return f"step {step:,}" + (f": {text}" if text else ""), pictures
 
 
-def _row(folder: Path, names: list[str]) -> tuple[str, list[Image.Image | None]]:
-    return "", [_picture(folder / f"{name}.png") for name in names]
+def _pictures(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
+    return [read_picture(folder / f"{name}.png", SIDE, LARGEST) for name in names]
 
 
-def _picture(path: Path) -> Image.Image | None:
-    """None for a file that is missing, too large or no picture."""
-    if not is_regular(path):
-        return None
-    try:
-        with Image.open(path, formats=("PNG",)) as image:
-            return shrunk(image.convert("RGB"), SIDE) if image.width * image.height <= LARGEST else None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
-
-
-def _cards(title: str, kinds: Iterable[str], rows: list[tuple[str, list[Image.Image | None]]]) -> str:
+def _cards(title: str, kinds: Iterable[str], rows: list[Row]) -> str:
     shown = [(text, pictures) for text, pictures in rows if any(pictures)]
     if not shown:
         return ""

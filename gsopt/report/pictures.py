@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from gsopt.data.files import is_regular
 from gsopt.film import write_film
 
 QUALITY = 88
@@ -29,6 +31,17 @@ def shrunk(image: Image.Image, side: int) -> Image.Image:
     copy = image.copy()
     copy.thumbnail((side, side), Image.Resampling.LANCZOS)
     return copy
+
+
+def read_picture(path: Path, side: int, most_pixels: int) -> Image.Image | None:
+    """A PNG made to fit into a square of `side` px; None for a file that is missing, too large or no picture."""
+    if not is_regular(path):
+        return None
+    try:
+        with Image.open(path, formats=("PNG",)) as image:
+            return shrunk(image.convert("RGB"), side) if image.width * image.height <= most_pixels else None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
 
 
 def data_uri(image: Image.Image) -> str:

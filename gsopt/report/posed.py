@@ -7,11 +7,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from gsopt.data.files import is_regular, read_json
 from gsopt.errors import InputError
-from gsopt.report.pictures import data_uri, shrunk
+from gsopt.report.pictures import data_uri, read_picture
 
 SIDE = 1440
 LARGEST = 4096 * 4096
@@ -21,7 +19,7 @@ MOST_LINES = 40
 def section(dataset: Path, run: Path, messages: list[str]) -> str:
     """Empty where the poses were given and kept. What cannot be read is left out and said in `messages`."""
     lines = [*_found(dataset / "sfm.json", messages), *_refined(run / "poses.json", messages)]
-    picture = _picture(dataset / "sfm.png")
+    picture = read_picture(dataset / "sfm.png", SIDE, LARGEST)
     if not lines and picture is None:
         return ""
     drawn = "" if picture is None else f'<img src="{data_uri(picture)}" style="width:100%" alt="Cameras and points">'
@@ -59,14 +57,3 @@ def _read(path: Path, messages: list[str]) -> dict[str, Any]:
         messages.append(f"Where the cameras came from cannot be shown. {error}")
         return {}
     return document if isinstance(document, dict) else {}
-
-
-def _picture(path: Path) -> Image.Image | None:
-    """None for a file that is missing, too large or no picture."""
-    if not is_regular(path):
-        return None
-    try:
-        with Image.open(path, formats=("PNG",)) as image:
-            return shrunk(image.convert("RGB"), SIDE) if image.width * image.height <= LARGEST else None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None

@@ -147,9 +147,7 @@ def encode(
         image_tokens, note = _matched(embeddings, tokens, image_weight)
         notes += note
     elif len(references) and embeddings is None:
-        notes.append(
-            "The reference images are not used: the prior has no CLIP image encoder. Give one with --guidance.clip."
-        )
+        notes.append(NO_IMAGE_ENCODER)
     wants_class = embeddings is not None and class_embedding_width == embeddings.shape[1]
     return Conditioning(
         encoder=encoder.name,
