@@ -18,25 +18,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from gsopt.benchmark.suite_arms import PLAIN
+
 RESULTS = Path(__file__).parent / "results" / "scenes.json"
 DEMO, LEGO, FOX = "gsopt/demo", "nerf_synthetic_lego_400", "fox"
 # The eight input views of the few-shot protocol (Jain et al. 2021).
 EIGHT = ["--view-ids", "2,16,26,55,73,75,86,93"]
-# The settings of Kerbl et al. 2023, nothing of ours: 100,000 random points, no regularizer for few views.
-PLAIN = [
-    "--lambda-sds",
-    "0",
-    "--sparse.below-views",
-    "0",
-    "--init",
-    "random",
-    "--init-count",
-    "100000",
-    "--optimizer.lr-means",
-    "1.6e-4",
-]
-PLAIN += ["--optimizer.lr-means-final", "1.6e-6", "--optimizer.lr-log-scales", "5e-3", "--optimizer.lr-sh0", "2.5e-3"]
-PLAIN += ["--optimizer.lr-shN", "1.25e-4", "--schedule.coarse-until", "--max-gaussians", "1000000"]
 CASES: dict[str, tuple[str, list[str]]] = {
     "demo": (DEMO, ["--iterations", "2000", "--lambda-sds", "0"]),  # as `make demo`, which installs no diffusers
     "lego-100": (LEGO, []),

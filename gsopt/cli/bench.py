@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import arg
 
 from gsopt import check
-from gsopt.errors import UsageError
+from gsopt.errors import InputError, UsageError
 from gsopt.presets import Preset
 
 Part = Literal["cases", "growth", "accuracy"]
@@ -73,8 +73,36 @@ class Draw:
     """The page that has the block `kernels` or `scenes`; charts go to img/ beside it."""
 
 
+@dataclass(frozen=True)
+class Suite:
+    """Train every arm on every scene of a suite and record all figures; runs that have a record are not made again."""
+
+    suite: Annotated[str, arg(metavar="sparse|paper|smoke")]
+    """Which one: gsopt/benchmark/suites has their declarations."""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="FILE.json")]
+    """Result file, written after every run; at the end FILE.md and FILE.html are drawn beside it."""
+    root: Annotated[Path | None, arg(metavar="DATA")] = None
+    """Folder that holds the suite's scenes; smoke brings its own."""
+    seeds: int = 3
+    """Seeds 0 to N-1 of every run, the first of all runs before the second."""
+    arms: Annotated[tuple[str, ...], arg(metavar="ARM")] = ()
+    """3dgs, ours-0, ours, ours-user, ours-template, ours-llm; all of the suite when not given."""
+    groups: Annotated[tuple[str, ...], arg(metavar="GROUP")] = ()
+    """Parts of the suite, in its own order; all when not given."""
+    threads: int = 1
+    """Of every run. The figures do not depend on it."""
+    prior: Annotated[str, arg(metavar="PRIOR")] = ""
+    """Guides the guided arms, as `gsopt train --prior`; gsopt's own choice when not given."""
+    llm: Annotated[str, arg(metavar="URL")] = ""
+    """Language model of the arm ours-llm, as `gsopt prompts --llm`."""
+    model: Annotated[str, arg(metavar="NAME")] = ""
+    """Its name there."""
+
+
 def main(argv: Sequence[str]) -> int:
-    """Measure or draw, say where it went, and return 0."""
+    """Measure or draw, say where it went, and return 0. `--suite` needs no word before it."""
+    if any(word.partition("=")[0] == "--suite" for word in argv) and argv[0].startswith("-"):
+        return suite(tyro.cli(Suite, prog="gsopt bench", args=list(argv)), argv)
     verbs: dict[str, Any] = {"kernels": Kernels, "scenes": Scenes, "draw": Draw}
     flags = tyro.extras.subcommand_cli_from_dict(verbs, prog="gsopt bench", description=__doc__, args=list(argv))
     if isinstance(flags, Draw):
@@ -192,6 +220,29 @@ def run_line(record: dict[str, Any]) -> str:
         f"{record['scene']} {what}: {last['step']:,} steps, {last['gaussians']:,} Gaussians, "
         f"{last['cpu_seconds']:.1f} s CPU, {last['psnr']:.2f} dB"
     )
+
+
+def suite(flags: Suite, argv: Sequence[str]) -> int:
+    """`gsopt bench --suite`: 0, or 3 when some runs failed."""
+    check.within("--seeds", flags.seeds, 1, 1000, "3 is usual.")
+    check.within("--threads", flags.threads, 1, 256, "The figures do not depend on it.")
+
+    from gsopt.benchmark import suite as declared
+
+    whole = declared.load(flags.suite)
+    part = declared.chosen(whole, flags.groups)
+    cases = list(declared.cases(part, flags.seeds, flags.arms))
+    root = declared.find_root(part, flags.root)
+
+    from gsopt.benchmark.suite_bench import run_suite, work_folder
+    from gsopt.benchmark.suite_run import Bench
+
+    output = flags.output.absolute()
+    bench = Bench(root, work_folder(output), flags.threads, flags.prior, flags.llm, flags.model)
+    command = "gsopt bench " + shlex.join(argv)
+    failed = run_suite(output, whole.name, command, cases, bench, lambda text: print(text, flush=True))
+    print(f"Written: {flags.output}")
+    return InputError.exit_code if failed else 0
 
 
 def draw(flags: Draw) -> int:

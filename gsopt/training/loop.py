@@ -70,12 +70,13 @@ def train(
     Raises UsageError for a folder that holds another run, InputError for unusable data, NumericalError when a value
     stops being finite.
     """
+    began = time.process_time()
     with opened(Path(run), config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
         with one_torch_thread():
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
             guidance = start_guidance(config, scene, backend, directory)
-            trainer, clock = _start(config, scene, backend, directory, guidance)
+            trainer, clock = _start(config, scene, backend, directory, guidance, began)
             stopped = _advance(trainer, directory, stop, clock)
             _finish(trainer, directory, clock)
             if guidance is not None:
@@ -145,9 +146,14 @@ class Clock:
 
 
 def _start(
-    config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory, guidance: RunGuidance | None
+    config: TrainConfig,
+    scene: Scene,
+    backend: Backend,
+    directory: RunDirectory,
+    guidance: RunGuidance | None,
+    began: float,
 ) -> tuple[Trainer, Clock]:
-    """A trainer at step 0 or at the newest checkpoint, and the time already spent."""
+    """A trainer at step 0 or at the newest checkpoint, and the time already spent. `began`: in CPU seconds."""
     names = [view.name for view in scene.train]
     checkpoint = load_newest(directory.checkpoints, directory.warn)
     if checkpoint is None:
@@ -174,6 +180,7 @@ def _start(
         test_views=len(scene.test),
         sparse=schedule.is_sparse(config, len(names)),
         guidance=directory.recorded("guidance"),
+        setup_cpu_seconds=round(time.process_time() - began, 3),
     )
     for warning in scene.warnings:
         directory.warn(warning)

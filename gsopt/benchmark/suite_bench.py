@@ -1,0 +1,82 @@
+"""Makes the runs of a suite that have no record yet, one after the other, and writes after each."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsopt.benchmark import suite_file, suite_run
+from gsopt.benchmark.machine import machine
+from gsopt.benchmark.suite import Case
+from gsopt.benchmark.suite_run import Bench, RunFailed
+
+Tell = Callable[[str], None]
+
+
+def work_folder(path: Path) -> Path:
+    """Where the runs of a result file lie while they are made."""
+    return path.with_name(f"{path.stem}-runs")
+
+
+def run_suite(path: Path, suite: str, command: str, cases: Sequence[Case], bench: Bench, tell: Tell) -> list[str]:
+    """Bring the result file up to date with `cases`; returns what failed. A kill loses the run that was being made.
+
+    Raises UsageError and InputError for a file of another suite or a broken one, before anything is run.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with suite_file.locked(path):
+        document = suite_file.opened(path, suite, command)
+        bench.work.mkdir(parents=True, exist_ok=True)
+        for stale in bench.work.glob("run-*"):  # of a killed call
+            shutil.rmtree(stale, ignore_errors=True)
+        torch.set_num_threads(1)
+        failed: list[str] = []
+        for number, case in enumerate(cases, 1):
+            document, told = _one(path, document, case, bench)
+            if told:
+                tell(f"{number}/{len(cases)} {told}")
+            failed += [case.id] if " failed: " in told else []
+        return failed
+
+
+def _one(path: Path, document: dict[str, Any], case: Case, bench: Bench) -> tuple[dict[str, Any], str]:
+    """The document after one case, written when it changed, and what there is to tell."""
+    told = ""
+    if (reason := suite_run.reason_to_skip(case, bench)) is not None:
+        skip = {**_named(case), "reason": reason}
+        if skip in document["skipped"]:
+            return document, ""
+        document = suite_file.with_skip(document, skip)
+    else:
+        key = suite_run.key(case, bench)
+        if any(run["key"] == key and suite_file.run_id(run) == case.id for run in document["runs"]):
+            return document, ""
+        try:
+            record, protocol, pictures = suite_run.measure(case, bench)
+        except RunFailed as error:
+            return document, f"{case.id} failed: {error}"
+        document = suite_file.with_run(document, record, machine(), protocol)
+        if pictures:
+            suite_file.write_pictures(path, {**suite_file.read_pictures(path), **pictures})
+        told = line(record)
+    suite_file.write(path, document)
+    return document, told
+
+
+def _named(case: Case) -> dict[str, Any]:
+    return {name: value for name, value in asdict(case).items() if name in suite_file.ID}
+
+
+def line(record: dict[str, Any]) -> str:
+    """A run in one line of the printed table."""
+    mean = record["mean"]
+    seconds = record["setup_cpu_seconds"] + record["train_cpu_seconds"]
+    return (
+        f"{record['scene']}, {record['views_in']} views, {record['arm']}, {record['iterations']} steps, "
+        f"seed {record['seed']}: {mean['psnr']:.2f} dB, LPIPS {mean['lpips_alex']}, {seconds:.0f} s CPU"
+    )
