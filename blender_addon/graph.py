@@ -37,10 +37,11 @@ class Value:
 class Graph:
     """A node tree that is being written; nodes are laid out in columns as they are made."""
 
-    def __init__(self, tree: Any) -> None:
+    def __init__(self, tree: Any, groups: dict[str, Any] | None = None) -> None:
         self.tree = tree
+        self.groups = groups or {}
+        """Trees that this one may use, by name."""
         self.made = 0
-        self.is_shader = tree.bl_idname == "ShaderNodeTree"
 
     def node(self, kind: str, **settings: Any) -> Any:
         node = self.tree.nodes.new(kind)
@@ -74,6 +75,13 @@ class Graph:
             for socket, term in zip(used, inputs, strict=False):
                 self.feed(socket, term)
         return self.out(node, out)
+
+    def use(self, name: str, inputs: dict[str, Term]) -> dict[str, Value]:
+        """The outputs of another tree, by name."""
+        node = self.node("GeometryNodeGroup", node_tree=self.groups[name])
+        for socket, term in inputs.items():
+            self.feed(node.inputs[socket], term)
+        return {socket.name: Value(self, socket) for socket in node.outputs}
 
     def math(self, operation: str, *terms: Term, clamp: bool = False) -> Value:
         """A scalar operation, or its component-wise form as soon as a vector takes part."""

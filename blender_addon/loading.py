@@ -20,6 +20,8 @@ from .core.spz import read_spz
 
 SLICE = 0.005
 """Seconds of the main thread after which a tick begins nothing more."""
+Finish = Callable[[Any, Any, statistics.Summary], None]
+"""Gets the scene, the mesh and what can be said about it."""
 SUMMARIES: dict[str, statistics.Summary] = {}
 """By name of the mesh; made anew when asked for."""
 
@@ -43,13 +45,12 @@ def read(path: Path, progress: Callable[[float], None] = lambda share: None) -> 
 
 
 class Loading:
-    """One file on its way into an object."""
+    """One file on its way into a mesh of a scene."""
 
-    def __init__(self, path: Path, most: int, finish: Callable[[Any, statistics.Summary], None]) -> None:
+    def __init__(self, path: Path, most: int, finish: Finish) -> None:
         self.path, self.most, self.finish = path, most, finish
         self.share = 0.0
         self.error = ""
-        self.over = False
         self._read: tuple[list[splat_object.Part], statistics.Summary] | None = None
         self._steps: Iterator[Any] | None = None
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -70,27 +71,20 @@ class Loading:
     def _tell(self, share: float) -> None:
         self.share = share
 
-    def advance(self) -> None:
-        """Hand over for at most a slice of time; afterwards `over` tells whether all is done."""
+    def advance(self, scene: Any) -> bool:
+        """Hand over for at most a slice of time; whether all is done or has failed."""
         if self._thread.is_alive():
-            return
+            return False
         if self.error or self._read is None:
-            self.over = True
-            return
+            return True
         if self._steps is None:
             self._steps = splat_object.mesh_in_steps(bpy, self.path.stem, self._read[0])
         until = time.perf_counter() + SLICE
         for mesh in self._steps:
             if mesh is not None:
                 SUMMARIES[mesh.name] = self._read[1]
-                self.over = True
-                self.finish(mesh, self._read[1])
-                return
+                self.finish(scene, mesh, self._read[1])
+                return True
             if time.perf_counter() > until:
-                return
-
-    def wait(self) -> None:
-        """To the end, where there is no window to hold up."""
-        self._thread.join()
-        while not self.over:
-            self.advance()
+                break
+        return False

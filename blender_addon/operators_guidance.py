@@ -11,7 +11,7 @@ import bpy
 from . import watching
 from .core import arguments, job, prompts
 from .core.errors import UsageError
-from .operators_source import refuse_two, settle
+from .operators_source import begin, refuse_two
 from .preferences import absolute, preferences, python, work_folder
 from .telling import Telling, Waiting
 
@@ -117,7 +117,7 @@ class GSOPT_OT_propose(Waiting, bpy.types.Operator):
         folder = job.free_folder(work_folder(context) / "jobs", "prompts")
         out = folder / "prompts.json"
         call = arguments.prompts(python(context), writing, out)
-        return settle(context, self, job.start("prompts", call, folder, out))
+        return begin(context, self, job.start("prompts", call, folder, out))
 
 
 class GSOPT_OT_proposal(Telling, bpy.types.Operator):

@@ -27,11 +27,13 @@ UPRIGHT = Matrix.Rotation(-math.pi / 2, 4, "X")
 def active_splats(context: Any) -> Any:
     """The active object, or the only splats there are. UsageError where that is unclear."""
     active = context.view_layer.objects.active
+    found = [o for o in context.scene.objects if splat_object.is_splats(o) and not o.get(watching.LIVE)]
     if splat_object.is_splats(active):
-        return active
-    found = [o for o in context.scene.objects if splat_object.is_splats(o) and not o.get("gsopt_live")]
+        found = [active]
     if len(found) != 1:
         raise UsageError(f"{len(found)} objects hold splats. Select the one that is meant, or import one.")
+    if found[0].mode == "EDIT":
+        raise UsageError("The splats are being edited. Leave Edit Mode (Tab) first.")
     return found[0]
 
 
@@ -72,40 +74,29 @@ class GSOPT_OT_import_splats(Waiting, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         scene, settings = context.scene, context.scene.gsopt
-        if watching.is_importing():
+        if settings.job_import.state == "RUNNING":
             raise UsageError("A file is being imported. Wait for it.")
         chosen = settings.run_path if self.from_run else self.filepath
         if not chosen:
             raise UsageError("No splats are named. Choose a file, or attach to a run first.")
-        source = absolute(chosen)
+        source, replaces_live = absolute(chosen), self.from_run
         path = loading.splat_file(source)
-        run = source if source.is_dir() else path.parent
-        matrix, name = frame(settings, data_of(run)), scene.name_full
+        matrix = frame(settings, data_of(source if source.is_dir() else path.parent))
 
-        def finish(mesh: Any, summary: statistics.Summary) -> None:
-            target = bpy.data.scenes[name]
-            thing = watching.add_object(target, mesh, summary, str(source), settings_of(name).display)
+        def finish(target: Any, mesh: Any, summary: statistics.Summary) -> None:
+            thing = watching.add_object(target, mesh, summary, str(source), target.gsopt.display)
             thing.matrix_world = matrix
-            for other in [o for o in target.objects if o.get("gsopt_live")]:
-                bpy.data.objects.remove(other)
+            live = watching.live_object(target) if replaces_live else None
+            if live is not None:
+                splat_object.remove(bpy, live)
             let_cycles_see_through(target)
             activate(thing)
-            if not bpy.app.background:
-                with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
-                    bpy.ops.ed.undo_push(message="Import Splats")
+            watching.undo_step("Import Splats")
 
-        found = watching.load(scene, path, finish)
-        if self.waits:
-            found.wait()
-            watching.look(scene)
-            if found.error:
-                raise InputError(found.error)
-            return f"{path.name} imported"
-        return f"Reading {path.name}"
-
-
-def settings_of(scene: str) -> Any:
-    return bpy.data.scenes[scene].gsopt
+        watching.load(scene, path, finish)
+        state = settings.job_import
+        self.settle(lambda: state.state == "RUNNING", lambda: settings.message if state.state == "FAILED" else "")
+        return f"{path.name} imported" if self.waits else f"Reading {path.name}"
 
 
 def activate(thing: Any) -> None:

@@ -10,28 +10,25 @@ import bpy
 from . import watching
 from .core import arguments, job
 from .core import run as runs
-from .core.errors import GsoptError, InputError, UsageError
+from .core.errors import InputError, UsageError
 from .operators_guidance import guidance
-from .operators_source import LONG, safe
+from .operators_source import safe
 from .preferences import absolute, python, work_folder
-from .telling import Telling, Waiting
-
-OPEN = ("waiting", "running")
+from .telling import LONG, Telling, Waiting
 
 
 def going_on(scene: Any) -> bool:
-    return scene.gsopt.run_status in OPEN
+    return scene.gsopt.run_status in watching.OPEN
 
 
-def settle(context: Any, operator: Any, said: str) -> str:
-    """Without a window: follow the run to its end. GsoptError when it failed."""
-    if not operator.waits:
-        return said
-    watching.wait(context.scene, lambda: not going_on(context.scene), LONG)
+def follow(context: Any, operator: Waiting, said: str) -> str:
+    """Without a window: to the end of the run."""
     settings = context.scene.gsopt
-    if settings.run_status not in ("done", "stopped"):
-        raise GsoptError(settings.run_message)
-    return f"{settings.run_status} after {settings.run_step} steps"
+    fine = (*watching.OPEN, "done", "stopped")
+    operator.settle(
+        lambda: going_on(context.scene), lambda: "" if settings.run_status in fine else settings.run_message
+    )
+    return f"{settings.run_status} after {settings.run_step} steps" if operator.waits else said
 
 
 class GSOPT_OT_launch(Waiting, bpy.types.Operator):
@@ -45,15 +42,16 @@ class GSOPT_OT_launch(Waiting, bpy.types.Operator):
         watching.look(context.scene)
         if going_on(context.scene):
             raise UsageError("A run is going on. Stop it first, or open another scene.")
-        data = absolute(settings.photos if settings.source == "PHOTOS" else settings.dataset)
-        if not (settings.photos if settings.source == "PHOTOS" else settings.dataset) or not data.exists():
+        chosen = settings.photos if settings.source == "PHOTOS" else settings.dataset
+        data = absolute(chosen)
+        if not chosen or not data.exists():
             raise InputError("There is no dataset. Render one, choose a folder, or find the poses of photos.")
         work = work_folder(context)
         run = job.free_folder(work / "runs", safe(data))
         folder = job.free_folder(work / "jobs", "train")
         call = arguments.train(python(context), data, run, training(settings), guidance(settings, folder))
         watching.attach(context.scene, run, job.start("train", call, folder, run))
-        return settle(context, self, f"Started {run.name}")
+        return follow(context, self, f"Started {run.name}")
 
 
 def training(settings: Any) -> arguments.Training:
@@ -87,7 +85,7 @@ class GSOPT_OT_resume(Waiting, bpy.types.Operator):
         call = arguments.resume(python(context), run, settings.threads)
         told = runs.length(run)
         watching.attach(context.scene, run, job.start("train", call, folder, run), told)
-        return settle(context, self, f"{run.name} goes on")
+        return follow(context, self, f"{run.name} goes on")
 
 
 class GSOPT_OT_stop(Waiting, bpy.types.Operator):
@@ -107,7 +105,7 @@ class GSOPT_OT_stop(Waiting, bpy.types.Operator):
         else:
             runs.ask_to_stop(found.run.path)
         if self.waits:
-            watching.wait(context.scene, lambda: not going_on(context.scene), 600.0)
+            watching.wait(lambda: not going_on(context.scene), 600.0)
         return "Asked to stop"
 
 
@@ -149,7 +147,7 @@ class GSOPT_OT_follow(Telling, bpy.types.Operator):
         def over() -> bool:
             return not going_on(context.scene) or settings.run_step >= self.step
 
-        if not watching.wait(context.scene, over, self.seconds):
+        if not watching.wait(over, self.seconds):
             raise UsageError(f"The run is at step {settings.run_step} after {self.seconds:g} s. Wait longer.")
         return f"{settings.run_status}, step {settings.run_step}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,24 +10,17 @@ import bpy
 
 from . import watching
 from .core import arguments, job
-from .core.errors import GsoptError, InputError, UsageError
+from .core.errors import InputError, UsageError
 from .preferences import absolute, python, script, work_folder
 from .telling import Telling, Waiting
 
-LONG = 24 * 3600.0
-"""Seconds that an operator waits at most."""
 
-
-def settle(context: Any, operator: Any, work: job.Job) -> str:
-    """Follow a program; without a window until its end. GsoptError when it failed then."""
+def begin(context: Any, operator: Waiting, work: job.Job) -> str:
+    """Follow a program that was started, without a window until its end."""
     watching.started(context.scene, work)
-    if not operator.waits:
-        return "Started. The panel shows how far it is."
     entry = getattr(context.scene.gsopt, f"job_{work.kind}")
-    watching.wait(context.scene, lambda: entry.state != "RUNNING", LONG)
-    if entry.state == "FAILED":
-        raise GsoptError(entry.message)
-    return "Done."
+    operator.settle(lambda: entry.state == "RUNNING", lambda: entry.message if entry.state == "FAILED" else "")
+    return "Done." if operator.waits else "Started. The panel shows how far it is."
 
 
 def refuse_two(context: Any, kind: str) -> None:
@@ -44,7 +38,7 @@ class GSOPT_OT_test(Waiting, bpy.types.Operator):
         refuse_two(context, "doctor")
         context.scene.gsopt.doctor = "asking ..."
         folder = job.free_folder(work_folder(context) / "jobs", "doctor")
-        settle(context, self, job.start("doctor", arguments.doctor(python(context)), folder))
+        begin(context, self, job.start("doctor", arguments.doctor(python(context)), folder))
         return str(context.scene.gsopt.doctor)
 
 
@@ -68,18 +62,9 @@ class GSOPT_OT_render_dataset(Waiting, bpy.types.Operator):
         )
         out = job.free_folder(work_folder(context) / "datasets", safe(settings.collection or shapes[0]))
         folder = job.free_folder(work_folder(context) / "jobs", "dataset")
-        blender = bpy.app.binary_path
-        words = [blender, "" if blender else own_python(), script(context)]
-        mesh = write_shapes(folder, shapes)
-        call = arguments.render(str(words[0]), str(words[1]), Path(words[2]), mesh, out, rendering)
-        return settle(context, self, job.start("dataset", call, folder, out, rendering.total))
-
-
-def own_python() -> str:
-    """The Python that has bpy as a module, where there is no program Blender."""
-    import sys
-
-    return sys.executable
+        renderer, mesh = script(context), write_shapes(folder, shapes)
+        call = arguments.render(bpy.app.binary_path, sys.executable, renderer, mesh, out, rendering)
+        return begin(context, self, job.start("dataset", call, folder, out, rendering.total))
 
 
 def safe(thing: Any) -> str:
@@ -107,9 +92,8 @@ def write_shapes(folder: Path, shapes: list[Any]) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         for shape in shapes:
             stage.collection.objects.link(shape)
-        stage.view_layers[
-            0
-        ].update()  # Blender 5.2 crashes on writing a scene whose layers were never brought up to date
+        # Blender 5.2 crashes on writing a scene whose layers were never brought up to date.
+        stage.view_layers[0].update()
         bpy.data.libraries.write(str(path), {stage}, path_remap="ABSOLUTE", compress=False)
     except (OSError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {error}. Free some space or choose another work folder.") from error
@@ -136,7 +120,7 @@ class GSOPT_OT_find_poses(Waiting, bpy.types.Operator):
         out.parent.mkdir(parents=True, exist_ok=True)
         call = arguments.poses(python(context), photos, out, settings.seed, settings.threads)
         folder = job.free_folder(work_folder(context) / "jobs", "poses")
-        return settle(context, self, job.start("poses", call, folder, out))
+        return begin(context, self, job.start("poses", call, folder, out))
 
 
 class GSOPT_OT_cancel(Telling, bpy.types.Operator):

@@ -13,8 +13,8 @@ from .preferences import lines_of
 CATEGORY = "gsopt"
 
 
-class GSOPT_UL_prompts(bpy.types.UIList):
-    """Text, weight, polarity and view of each prompt in a row."""
+class Rows:
+    """A list whose rows need nothing but their item. Blender counts the arguments, so that none may be left out."""
 
     def draw_item(
         self,
@@ -28,6 +28,13 @@ class GSOPT_UL_prompts(bpy.types.UIList):
         index: int = 0,
         flag: int = 0,
     ) -> None:
+        self.draw_row(layout, item)  # type: ignore[attr-defined]
+
+
+class GSOPT_UL_prompts(Rows, bpy.types.UIList):
+    """Text, weight, polarity and view of each prompt in a row."""
+
+    def draw_row(self, layout: Any, item: Any) -> None:
         row = layout.row(align=True)
         row.prop(item, "text", text="", emboss=False, icon="ADD" if item.polarity == "positive" else "REMOVE")
         side = row.row(align=True)
@@ -35,21 +42,10 @@ class GSOPT_UL_prompts(bpy.types.UIList):
         side.label(text=f"{item.weight:g} {item.view}")
 
 
-class GSOPT_UL_paths(bpy.types.UIList):
+class GSOPT_UL_paths(Rows, bpy.types.UIList):
     """Files or folders by their last name."""
 
-    def draw_item(
-        self,
-        context: Any,
-        layout: Any,
-        data: Any,
-        item: Any,
-        icon: int,
-        active_data: Any,
-        active_property: str,
-        index: int = 0,
-        flag: int = 0,
-    ) -> None:
+    def draw_row(self, layout: Any, item: Any) -> None:
         layout.label(text=Path(item.path).name, icon="FILE")
 
 
@@ -69,9 +65,8 @@ class GSOPT_PT_main(Sidebar, bpy.types.Panel):
         settings, layout = context.scene.gsopt, self.layout
         if settings.message:
             tell(layout, settings.message, "ERROR")
-        row = layout.row(align=True)
-        row.prop(settings, "folder", text="Work")
-        row.operator("gsopt.test", text="", icon="CHECKMARK")
+        values(layout, settings, "folder")
+        layout.operator("gsopt.test", text="Test Interpreter", icon="CHECKMARK")
         if settings.doctor:
             tell(layout, settings.doctor, "INFO")
 
@@ -80,6 +75,15 @@ def tell(layout: Any, text: str, icon: str) -> None:
     box = layout.box().column(align=True)
     for place, line in enumerate(lines_of(text, 44)[:8]):
         box.label(text=line, icon=icon if place == 0 else "BLANK1")
+
+
+def values(layout: Any, owner: Any, *names: str) -> None:
+    """Properties under one another, their names to the left."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    for name in names:
+        column.prop(owner, name)
 
 
 def show_job(layout: Any, entry: Any, kind: str) -> bool:
@@ -106,21 +110,17 @@ class GSOPT_PT_source(Child, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         settings, layout = context.scene.gsopt, self.layout
         layout.row().prop(settings, "source", expand=True)
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
         if settings.source == "MESH":
-            column.prop(settings, "collection")
-            for name in ("render_views", "render_test_views", "render_size", "render_samples", "render_layout"):
-                column.prop(settings, name)
+            values(layout, settings, "collection", "render_views", "render_test_views", "render_size")
+            values(layout, settings, "render_samples", "render_layout")
             if not show_job(layout, settings.job_dataset, "dataset"):
                 layout.operator("gsopt.render_dataset", icon="RENDER_STILL")
         elif settings.source == "PHOTOS":
-            column.prop(settings, "photos")
+            values(layout, settings, "photos")
             if not show_job(layout, settings.job_poses, "poses"):
                 layout.operator("gsopt.find_poses", icon="CAMERA_DATA")
         else:
-            column.prop(settings, "dataset")
+            values(layout, settings, "dataset")
 
 
 class GSOPT_PT_guidance(Child, bpy.types.Panel):
@@ -129,30 +129,20 @@ class GSOPT_PT_guidance(Child, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         settings, layout = context.scene.gsopt, self.layout
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        column.prop(settings, "domain")
-        if settings.domain == "own":
-            column.prop(settings, "template")
-        column.prop(settings, "notes")
+        values(layout, settings, "domain", *(["template"] if settings.domain == "own" else []), "notes")
         if not show_job(layout, settings.job_prompts, "prompts"):
             layout.operator("gsopt.propose", icon="OUTLINER_OB_FONT")
         if len(settings.proposals):
             draw_proposal(layout, settings)
         draw_prompts(layout, settings)
         draw_references(layout, settings)
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        column.prop(settings, "prior")
+        values(layout, settings, "prior")
         if settings.prior == "FOLDER":
-            column.prop(settings, "prior_folder")
+            values(layout, settings, "prior_folder")
         if settings.prior not in ("off", "auto"):
-            column.prop(settings, "lambda_sds")
+            values(layout, settings, "lambda_sds")
         if settings.prior != "off":
-            column.prop(settings, "front_view")
-            column.prop(settings, "device")
+            values(layout, settings, "front_view", "device")
 
 
 def draw_proposal(layout: Any, settings: Any) -> None:
@@ -211,16 +201,12 @@ class GSOPT_PT_run(Child, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         settings, layout = context.scene.gsopt, self.layout
         layout.row().prop(settings, "preset", expand=True)
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
         if settings.preset == "own":
-            for name in ("iterations", "downscale", "strategy", "background", "hold_out"):
-                column.prop(settings, name)
-        for name in ("budget", "views", "threads", "live"):
-            column.prop(settings, name)
+            values(layout, settings, "iterations", "downscale", "strategy", "background", "hold_out")
+        values(layout, settings, "budget", "views", "threads", "live")
         if settings.run_status in ("waiting", "running"):
             draw_progress(layout, settings)
+            draw_colors(layout, context)
         else:
             layout.operator("gsopt.launch", icon="PLAY")
             draw_outcome(layout, settings)
@@ -239,7 +225,8 @@ def draw_progress(layout: Any, settings: Any) -> None:
         tell(layout, settings.run_message, "INFO")
     row = layout.row(align=True)
     row.operator("gsopt.stop", icon="PAUSE").kill = False
-    row.operator("gsopt.stop", text="End at Once", icon="CANCEL").kill = True
+    if settings.run_job:
+        row.operator("gsopt.stop", text="End at Once", icon="CANCEL").kill = True
     row.operator("gsopt.log", text="", icon="TEXT")
 
 
@@ -285,11 +272,7 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         settings, layout = context.scene.gsopt, self.layout
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
-        for name in ("display", "most_shown", "up"):
-            column.prop(settings, name)
+        values(layout, settings, "display", "most_shown", "up")
         if not show_job(layout, settings.job_import, "import"):
             layout.operator("gsopt.import_splats", icon="IMPORT")
         row = layout.row(align=True)
@@ -300,6 +283,7 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
         active = context.view_layer.objects.active
         if splat_object.is_splats(active):
             draw_display(layout, active)
+            draw_colors(layout, context)
             draw_summary(layout, active)
             draw_filters(layout, settings)
 
@@ -307,11 +291,22 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
 def draw_display(layout: Any, thing: Any) -> None:
     box = layout.box()
     box.label(text=thing.name, icon="POINTCLOUD_DATA")
-    column = box.column()
-    column.use_property_split = True
-    column.use_property_decorate = False
-    for name in ("display", "size", "extent", "least_opacity", "most_shown", "color_by_view", "linear_color"):
-        column.prop(thing.gsopt, name)
+    values(
+        box, thing.gsopt, "display", "size", "extent", "least_opacity", "most_shown", "color_by_view", "linear_color"
+    )
+
+
+def draw_colors(layout: Any, context: Any) -> None:
+    """What decides whether splats show their own colors: Blender's Solid view is grey, AgX is paler than the photos."""
+    shading, view = context.space_data.shading, context.scene.view_settings
+    if shading.type in ("SOLID", "WIREFRAME"):
+        row = layout.row()
+        row.label(text="Colors show in")
+        row.prop_enum(shading, "type", "MATERIAL", text="Material Preview")
+    elif view.view_transform not in ("Standard", "Raw"):
+        row = layout.row()
+        row.label(text="Colors as learned")
+        row.prop_enum(view, "view_transform", "Standard")
 
 
 def draw_summary(layout: Any, thing: Any) -> None:
@@ -333,15 +328,8 @@ def draw_summary(layout: Any, thing: Any) -> None:
 
 def draw_filters(layout: Any, settings: Any) -> None:
     box = layout.box()
-    column = box.column()
-    column.use_property_split = True
-    column.use_property_decorate = False
-    for name in ("least_opacity", "largest_scale", "farthest"):
-        column.prop(settings, name)
-    if settings.farthest:
-        column.prop(settings, "center")
-    column.prop(settings, "box")
-    column.prop(settings, "no_outliers")
+    values(box, settings, "least_opacity", "largest_scale", "farthest", *(["center"] if settings.farthest else []))
+    values(box, settings, "box", "no_outliers")
     row = box.row(align=True)
     row.operator("gsopt.filter", text="Hide")
     row.operator("gsopt.show_all")

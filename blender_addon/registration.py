@@ -35,6 +35,25 @@ def after_load(*_: Any) -> None:
     watching.pick_up()
 
 
+@persistent
+def before_undo(*_: Any) -> None:
+    watching.before_undo()
+
+
+@persistent
+def after_undo(*_: Any) -> None:
+    watching.after_undo()
+
+
+HANDLERS = {
+    "load_post": after_load,
+    "undo_pre": before_undo,
+    "undo_post": after_undo,
+    "redo_pre": before_undo,
+    "redo_post": after_undo,
+}
+
+
 def menu(self: Any, context: Any) -> None:
     self.layout.operator("gsopt.import_splats", text="Gaussian Splats (.ply, .spz)")
 
@@ -50,7 +69,8 @@ def register() -> None:
     bpy.types.Object.gsopt = bpy.props.PointerProperty(type=properties.GsoptObject)
     bpy.types.TOPBAR_MT_file_import.append(menu)
     bpy.types.TOPBAR_MT_file_export.append(export_menu)
-    bpy.app.handlers.load_post.append(after_load)
+    for moment, handler in HANDLERS.items():
+        getattr(bpy.app.handlers, moment).append(handler)
     if not bpy.app.background:
         bpy.app.timers.register(after_load, first_interval=0.1)  # the file that is open when it is enabled
 
@@ -59,8 +79,9 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(after_load):
         bpy.app.timers.unregister(after_load)
     watching.forget()
-    if after_load in bpy.app.handlers.load_post:
-        bpy.app.handlers.load_post.remove(after_load)
+    for moment, handler in HANDLERS.items():
+        if handler in getattr(bpy.app.handlers, moment):
+            getattr(bpy.app.handlers, moment).remove(handler)
     bpy.types.TOPBAR_MT_file_export.remove(export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(menu)
     del bpy.types.Object.gsopt

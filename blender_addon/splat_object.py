@@ -44,7 +44,10 @@ def parts_of(splats: Splats) -> list[Part]:
 
 
 def mesh_in_steps(bpy: Any, name: str, parts: list[Part]) -> Iterator[Any]:
-    """A mesh made bit by bit: None after every attribute, so that a timer can pause in between, then the mesh."""
+    """A mesh made bit by bit, and before it the nodes and the material: None after every bit, so that a timer can pause
+    in between, then the mesh."""
+    yield from (None for _ in nodes.node_groups(bpy))
+    material = splat_material(bpy)
     mesh = bpy.data.meshes.new(name)
     mesh[MARK] = 1
     mesh.vertices.add(len(parts[0][2]) // 3)
@@ -52,7 +55,7 @@ def mesh_in_steps(bpy: Any, name: str, parts: list[Part]) -> Iterator[Any]:
     for part in parts:
         put(mesh, *part)
         yield None
-    mesh.materials.append(splat_material(bpy))
+    mesh.materials.append(material)
     mesh.update_tag()
     yield mesh
 
@@ -116,12 +119,6 @@ def hide(mesh: Any, mask: Any) -> None:
     mesh.update_tag()
 
 
-def prepare(bpy: Any) -> None:
-    """Make the node group and the material now, which takes some 0.4 s, so that no preview has to wait for them."""
-    nodes.node_group(bpy)
-    splat_material(bpy)
-
-
 def make_object(bpy: Any, collection: Any, mesh: Any, median_size: float, most_shown: int, display: str) -> Any:
     """An object under the node group."""
     thing = bpy.data.objects.new(mesh.name, mesh)
@@ -141,6 +138,14 @@ def replace_mesh(bpy: Any, thing: Any, mesh: Any) -> None:
     thing.data = mesh
     if old.users == 0:
         bpy.data.meshes.remove(old)
+
+
+def remove(bpy: Any, thing: Any) -> None:
+    """The object, and its splats when nobody else uses them."""
+    mesh = thing.data
+    bpy.data.objects.remove(thing)
+    if mesh.users == 0:
+        bpy.data.meshes.remove(mesh)
 
 
 def modifier_of(thing: Any) -> Any:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import bpy
 
+from . import watching
 from .core.errors import GsoptError
+
+LONG = 24 * 3600.0
+"""Seconds that an operator waits at most."""
 
 
 class Telling:
@@ -39,3 +44,10 @@ class Waiting(Telling):
         if self.properties.is_property_set("wait"):  # type: ignore[attr-defined]
             return bool(self.wait)
         return bool(bpy.app.background)
+
+    def settle(self, going_on: Callable[[], bool], problem: Callable[[], str]) -> None:
+        """Without a window: wait until it is over. GsoptError with the problem that ended it."""
+        if self.waits:
+            watching.wait(lambda: not going_on(), LONG)
+            if problem():
+                raise GsoptError(problem())

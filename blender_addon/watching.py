@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,16 @@ from .core.statistics import Summary
 PAUSE, BUSY = 0.4, 0.02
 """Seconds between two looks, and while splats are handed over."""
 KINDS = ("dataset", "poses", "prompts", "doctor")
+OPEN = ("waiting", "running")
+"""States of a run that is going on."""
+LIVE = "gsopt_live"
+"""Custom property of the object that shows a run's newest splats."""
 TIMES: list[float] = []
 """Seconds of CPU that each tick took from the main thread, the newest last."""
 
-_followers: dict[str, runs.Follower] = {}
-_loads: dict[str, loading.Loading] = {}
+_followers: dict[int, runs.Follower] = {}
+_loads: dict[tuple[int, str], loading.Loading] = {}
+_kept: dict[int, list[Any]] = {}
 
 
 def watch() -> None:
@@ -39,9 +44,8 @@ def watch() -> None:
 
 def forget() -> None:
     """Drop everything that belongs to the file that was open."""
-    _followers.clear()
-    _loads.clear()
-    loading.SUMMARIES.clear()
+    for kept in (_followers, _loads, _kept, loading.SUMMARIES):
+        kept.clear()
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
 
@@ -52,8 +56,6 @@ def pick_up() -> None:
     for scene in bpy.data.scenes:
         if scene.gsopt.job_import.state == "RUNNING":
             scene.gsopt.job_import.state = "NONE"
-        if scene.gsopt.run_status in ("waiting", "running"):
-            splat_object.prepare(bpy)
     watch()
 
 
@@ -72,23 +74,65 @@ def tick() -> float | None:
 def look(scene: Any) -> bool:
     """Whether there is something to look at again. A defect of ours becomes a message, never the end of the timer."""
     settings = scene.gsopt
-    active = False
     for step in (look_at_jobs, look_at_run, look_at_loading):
         try:
-            active = step(scene) or active
-        except (GsoptError, ReferenceError) as error:
+            step(scene)
+        except GsoptError as error:
             settings.message = str(error)
+        except ReferenceError:
+            settings.message = "An undo took away what was being brought in. Import it again."
         except Exception as error:
             traceback.print_exc()
             settings.message = f"A defect of the extension: {error!r:.200}. Please report it."
-    return active
+    jobs = any(getattr(settings, f"job_{kind}").state == "RUNNING" for kind in KINDS)
+    return jobs or settings.run_status in OPEN or any(owner == scene.session_uid for owner, _ in _loads)
 
 
 def redraw() -> None:
+    """The panel and the preferences; the viewport draws itself when its splats change."""
     for window in bpy.context.window_manager.windows if bpy.context.window_manager else ():
         for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "PREFERENCES"):
-                area.tag_redraw()
+            for region in area.regions:
+                if (area.type, region.type) in (("VIEW_3D", "UI"), ("PREFERENCES", "WINDOW")):
+                    region.tag_redraw()
+
+
+def tell(entry: Any, **values: Any) -> None:
+    """Write what has changed: every write makes Blender look whether something must be drawn again."""
+    for name, value in values.items():
+        if getattr(entry, name) != value:
+            setattr(entry, name, value)
+
+
+# Undo takes scenes back to what they were, but a program that was started goes on.
+
+
+def told(settings: Any) -> Iterator[tuple[Any, str]]:
+    """Where the state of runs and programs stands: owner and name of each property."""
+    for name in settings.bl_rna.properties.keys():  # noqa: SIM118  a collection of Blender's
+        if name.startswith("run_"):
+            yield settings, name
+        elif name.startswith("job_"):
+            yield from ((getattr(settings, name), part) for part in ("state", "folder", "message", "share"))
+
+
+def before_undo() -> None:
+    for scene in bpy.data.scenes:
+        _kept[scene.session_uid] = [getattr(owner, name) for owner, name in told(scene.gsopt)]
+
+
+def after_undo() -> None:
+    for scene in bpy.data.scenes:
+        for (owner, name), value in zip(told(scene.gsopt), _kept.pop(scene.session_uid, ()), strict=False):
+            tell(owner, **{name: value})
+    watch()
+
+
+def undo_step(name: str) -> None:
+    """Something was done that no operator's own undo step covers."""
+    if not bpy.app.background:
+        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+            bpy.ops.ed.undo_push(message=name)
 
 
 # Programs
@@ -101,14 +145,11 @@ def started(scene: Any, work: job.Job) -> None:
     watch()
 
 
-def look_at_jobs(scene: Any) -> bool:
-    active = False
+def look_at_jobs(scene: Any) -> None:
     for kind in KINDS:
         entry = getattr(scene.gsopt, f"job_{kind}")
         if entry.state == "RUNNING":
             look_at_job(scene, kind, entry)
-            active = active or entry.state == "RUNNING"
-    return active
 
 
 def look_at_job(scene: Any, kind: str, entry: Any) -> None:
@@ -116,13 +157,14 @@ def look_at_job(scene: Any, kind: str, entry: Any) -> None:
         work = job.read_job(Path(entry.folder))
         lives = job.alive(work)
         if kind == "dataset" and work.total:
-            entry.share = min(1.0, dataset.pictures(Path(work.product)) / work.total)
-            entry.message = f"{round(entry.share * work.total)} of {work.total} views"
+            made = min(dataset.pictures(Path(work.product)), work.total)
+            tell(entry, share=made / work.total, message=f"{made} of {work.total} views")
         elif lives:
-            entry.message = job.last_words(work)
+            tell(entry, message=job.last_words(work))
         if not lives:
             FINISH[kind](scene, work)
             entry.state, entry.share = "DONE", 1.0
+            undo_step(f"gsopt: {kind}")
     except GsoptError as error:
         entry.state, entry.message = "FAILED", str(error)
         scene.gsopt.message = str(error)
@@ -194,8 +236,7 @@ def attach(scene: Any, run: Path, work: job.Job | None = None, told: int = 0) ->
     settings.run_status, settings.run_message, settings.run_preview = "waiting", "", ""
     settings.run_step = settings.run_total = settings.run_count = 0
     settings.run_psnr = settings.run_eta = -1.0
-    _followers[scene.name_full] = runs.Follower(run, work, told)
-    splat_object.prepare(bpy)
+    _followers[scene.session_uid] = runs.Follower(run, work, told)
     watch()
 
 
@@ -204,82 +245,68 @@ def follower(scene: Any) -> runs.Follower | None:
     settings = scene.gsopt
     if not settings.run_path or not settings.run_status:
         return None
-    known = _followers.get(scene.name_full)
+    known = _followers.get(scene.session_uid)
     if known is None or str(known.run.path) != settings.run_path:
         try:
             work = job.read_job(Path(settings.run_job)) if settings.run_job else None
         except GsoptError:
             work = None  # the folder of the job is gone; the events name the process
-        known = _followers[scene.name_full] = runs.Follower(Path(settings.run_path), work)
+        known = _followers[scene.session_uid] = runs.Follower(Path(settings.run_path), work)
     return known
 
 
-def look_at_run(scene: Any) -> bool:
+def look_at_run(scene: Any) -> None:
     found = follower(scene)
     if found is None:
-        return False
+        return
     run, settings = found.poll(), scene.gsopt
-    settings.run_status, settings.run_step, settings.run_total = run.status, run.step, run.total
-    settings.run_count = run.count
-    settings.run_psnr = -1.0 if run.psnr is None else run.psnr
-    settings.run_eta = -1.0 if run.eta is None else run.eta
-    settings.run_message = run.problem or (run.messages[-1] if run.messages else "")
-    if settings.live and run.preview and run.preview != settings.run_preview and "live" not in _loads:
+    psnr, eta = (-1.0 if value is None else value for value in (run.psnr, run.eta))
+    tell(settings, run_status=run.status, run_step=run.step, run_total=run.total, run_count=run.count)
+    tell(settings, run_psnr=psnr, run_eta=eta, run_message=run.problem or (run.messages[-1] if run.messages else ""))
+    if settings.live and run.preview not in ("", settings.run_preview) and (scene.session_uid, "live") not in _loads:
         settings.run_preview = run.preview
-        show_live(scene, Path(run.preview))
-    return run.status in ("waiting", "running")
+        _loads[scene.session_uid, "live"] = loading.Loading(Path(run.preview), settings.live_most, show_live)
 
 
-def show_live(scene: Any, path: Path) -> None:
-    """Bring the newest splats into the viewport, thinned."""
-    name = scene.name_full
+def show_live(scene: Any, mesh: Any, summary: Summary) -> None:
+    """Bring the newest splats into the viewport."""
+    live = live_object(scene)
+    if live is None:
+        add_object(scene, mesh, summary, scene.gsopt.run_path, "Ellipsoids")[LIVE] = 1
+    else:
+        splat_object.replace_mesh(bpy, live, mesh)
 
-    def hand_over(mesh: Any, summary: Summary) -> None:
-        target = bpy.data.scenes.get(name)
-        live = next((o for o in target.objects if o.get("gsopt_live")), None) if target else None
-        if live is not None:
-            splat_object.replace_mesh(bpy, live, mesh)
-        elif target is not None:
-            add_object(target, mesh, summary, str(path), "Spheres")["gsopt_live"] = 1
 
-    _loads["live"] = loading.Loading(path, scene.gsopt.live_most, hand_over)
-    watch()
+def live_object(scene: Any) -> Any:
+    """The object that shows the run's newest splats, or None."""
+    return next((thing for thing in scene.objects if thing.get(LIVE)), None)
 
 
 # Files
 
 
-def load(scene: Any, path: Path, finish: Callable[[Any, Summary], None]) -> loading.Loading:
+def load(scene: Any, path: Path, finish: loading.Finish) -> None:
     """Bring a file in; `finish` gets the mesh."""
     entry = scene.gsopt.job_import
     entry.state, entry.message, entry.share = "RUNNING", path.name, 0.0
-    _loads["import"] = loading.Loading(path, 0, finish)
+    _loads[scene.session_uid, "import"] = loading.Loading(path, 0, finish)
     watch()
-    return _loads["import"]
 
 
-def is_importing() -> bool:
-    return "import" in _loads
-
-
-def look_at_loading(scene: Any) -> bool:
+def look_at_loading(scene: Any) -> None:
     entry = scene.gsopt.job_import
-    for name, found in list(_loads.items()):
+    for key in [key for key in _loads if key[0] == scene.session_uid]:
+        found, state = _loads.pop(key), "FAILED"
         try:
-            found.advance()
-        except BaseException:
-            _loads.pop(name, None)
-            entry.state = "FAILED" if name == "import" else entry.state
-            raise
-        if name == "import" and entry.state == "RUNNING":
-            entry.share = found.share
-        if found.over:
-            del _loads[name]
-            if found.error:
-                scene.gsopt.message = found.error
-            if name == "import":
-                entry.state, entry.message = ("FAILED" if found.error else "DONE"), found.error
-    return bool(_loads)
+            if not found.advance(scene):
+                _loads[key], state = found, "RUNNING"
+            elif not found.error:
+                state = "DONE"
+        finally:
+            if key[1] == "import":
+                tell(entry, state=state, share=found.share, message=found.error or found.path.name)
+        if state == "FAILED":
+            raise GsoptError(found.error)
 
 
 def add_object(scene: Any, mesh: Any, summary: Summary, came_from: str, display: str) -> Any:
@@ -292,7 +319,7 @@ def add_object(scene: Any, mesh: Any, summary: Summary, came_from: str, display:
     return thing
 
 
-def wait(scene: Any, over: Callable[[], bool], seconds: float) -> bool:
+def wait(over: Callable[[], bool], seconds: float) -> bool:
     """Look again and again where no timer ticks, until it is over or time is up; whether it is over."""
     until = time.monotonic() + seconds
     while True:
@@ -301,4 +328,4 @@ def wait(scene: Any, over: Callable[[], bool], seconds: float) -> bool:
             return True
         if time.monotonic() > until:
             return False
-        time.sleep(0.05)
+        time.sleep(0.02 if _loads else 0.05)

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-PHOTOS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif", ".bmp")
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
-
 
 @dataclass(frozen=True)
 class Training:
@@ -139,14 +136,3 @@ def render(blender: str, python: Path | str, script: Path, mesh: Path, out: Path
     words += ["--samples", str(rendering.samples), "--lighting", rendering.lighting]
     words += ["--seed", str(rendering.seed), "--threads", str(rendering.threads), "--points", "10000"]
     return words + (["--masks"] if rendering.masks else [])
-
-
-def needs_poses(source: Path) -> bool:
-    """Whether a source is a video or a folder of photos that no file gives poses for."""
-    if source.is_file():
-        return source.suffix.lower() in VIDEOS
-    posed = ("transforms_train.json", "transforms.json", "sparse", "colmap/sparse")
-    if not source.is_dir() or any((source / name).exists() for name in posed):
-        return False
-    folders = [folder for folder in (source, source / "images") if folder.is_dir()]
-    return any(file.suffix.lower() in PHOTOS for folder in folders for file in folder.iterdir())

@@ -37,12 +37,9 @@ class Run:
     total: int = 0
     count: int = 0
     """Gaussians."""
-    loss: float | None = None
     psnr: float | None = None
     eta: float | None = None
     """Seconds."""
-    speed: float | None = None
-    """Steps per second."""
     preview: str = ""
     """The newest file to show, absolute; empty where there is none."""
     pid: int = 0
@@ -50,13 +47,6 @@ class Run:
     """Time of the last `started`, seconds since 1970."""
     messages: list[str] = field(default_factory=list)
     """Warnings and errors, the newest last."""
-    history: list[tuple[int, float]] = field(default_factory=list)
-    """(step, PSNR), thinned."""
-
-    @property
-    def share(self) -> float:
-        """How far it is, 0 to 1."""
-        return min(1.0, self.step / self.total) if self.total > 0 else 0.0
 
     @property
     def problem(self) -> str:
@@ -125,14 +115,11 @@ class Follower:
             run.began = number(event.get("time")) or 0.0
         if kind == "progress":
             run.status = "running"
-            run.loss, run.psnr = number(event.get("loss")), number(event.get("psnr"))
-            run.eta, run.speed = number(event.get("eta_seconds")), number(event.get("steps_per_second"))
+            run.psnr, run.eta = number(event.get("psnr")), number(event.get("eta_seconds"))
         if kind in ("started", "progress", "done", "stopped"):
             run.step = whole(event.get("step"), run.step)
             run.total = whole(event.get("total"), run.total)
             run.count = whole(event.get("n"), run.count)
-        if kind == "progress" and run.psnr is not None:
-            run.history = thinned([*run.history, (run.step, run.psnr)])
         if kind == "preview":
             run.preview = inside(run.path, event.get("path")) or run.preview
         if kind in ("warning", "guidance", "error"):
@@ -197,10 +184,6 @@ def inside(run: Path, name: Any) -> str:
         return ""
     path = (run / name).resolve()
     return str(path) if path.is_relative_to(run.resolve()) else ""
-
-
-def thinned(history: list[tuple[int, float]]) -> list[tuple[int, float]]:
-    return history if len(history) <= 400 else history[::2]
 
 
 def length(run: Path) -> int:

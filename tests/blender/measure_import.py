@@ -20,7 +20,7 @@ import bpy  # noqa: E402
 import numpy as np  # noqa: E402
 from made_splats import random_splats  # noqa: E402
 
-from blender_addon import loading, splat_object  # noqa: E402
+from blender_addon import loading, nodes, splat_object  # noqa: E402
 from blender_addon.core import statistics  # noqa: E402
 from blender_addon.core.ply import write_ply  # noqa: E402
 
@@ -69,7 +69,8 @@ def measure(path: Path, count: int) -> dict[str, Any]:
 
 def main(folder: Path, counts: list[int]) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    splat_object.prepare(bpy)
+    splat_object.splat_material(bpy)
+    nodes.node_group(bpy)
     for count in counts:
         path = folder / f"{count}.ply"
         write_ply(path, random_splats(count))

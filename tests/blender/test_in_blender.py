@@ -261,7 +261,7 @@ def test_live_previews_replace_each_other_in_short_ticks(panel: Any, tmp_path: P
             events := events + event("preview", step=step, path=f"previews/step_{step}.ply")
         )
         bpy.ops.gsopt.attach(directory=str(run))
-        assert watching.wait(bpy.context.scene, lambda: panel.run_preview != "" and not watching._loads, 30)
+        assert watching.wait(lambda: panel.run_preview != "" and not watching._loads, 30)
     (live,) = (o for o in bpy.data.objects if o.get("gsopt_live"))
     assert len(live.data.vertices) == 2000
     assert len([mesh for mesh in bpy.data.meshes if mesh.get("gsopt_splats")]) == 1, "the old preview is gone"

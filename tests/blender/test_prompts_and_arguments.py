@@ -149,14 +149,3 @@ def test_synth_views_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (settings.views, settings.test_views, settings.resolution, settings.masks) == (3, 1, (32, 32), True)
     plain = arguments.render("", "python", Path("s.py"), tmp_path / "a.glb", tmp_path / "out", rendering)
     assert synth_views.own_arguments(plain[1:]) == synth_views.own_arguments(words)
-
-
-def test_photos_need_poses_and_datasets_do_not(tmp_path: Path) -> None:
-    assert not arguments.needs_poses(tmp_path)
-    (tmp_path / "a.JPG").touch()
-    assert arguments.needs_poses(tmp_path)
-    assert arguments.needs_poses(tmp_path / "a.JPG") is False
-    (tmp_path / "film.mp4").touch()
-    assert arguments.needs_poses(tmp_path / "film.mp4")
-    (tmp_path / "transforms.json").touch()
-    assert not arguments.needs_poses(tmp_path)

@@ -35,7 +35,7 @@ def test_events_are_told_as_they_come(tmp_path: Path) -> None:
     assert (follower.poll().status, follower.run.total, follower.run.count) == ("running", 100, 5)
     append(tmp_path, line("progress", 1, step=40, total=100, psnr=21.5, eta_seconds=3.0, n=9, loss=0.1))
     run = follower.poll()
-    assert (run.step, run.share, run.psnr, run.eta, run.count) == (40, 0.4, 21.5, 3.0, 9)
+    assert (run.step, run.total, run.psnr, run.eta, run.count) == (40, 100, 21.5, 3.0, 9)
     append(tmp_path, line("warning", 2, message="thin\x00 air\nhere"))
     assert follower.poll().messages == ["thin\x00 air here"]
     append(tmp_path, line("done", 3, step=100, n=12, seconds=1.0))
