@@ -1,4 +1,4 @@
-"""`gsopt bench`: measure gsopt on this machine, and draw what was measured."""
+"""Measure gsopt on this machine, and draw what was measured. `gsopt bench --suite NAME --help`: whole benchmarks."""
 
 from __future__ import annotations
 
@@ -68,9 +68,10 @@ class Draw:
     """Write the tables and charts of a page from a result file, without measuring anything."""
 
     json: Annotated[Path, arg(metavar="FILE")]
-    """What `gsopt bench kernels` or `gsopt bench scenes` wrote."""
+    """What `gsopt bench kernels`, `gsopt bench scenes` or `gsopt bench --suite` wrote."""
     page: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/performance.md")
-    """The page that has the block `kernels` or `scenes`; charts go to img/ beside it."""
+    """The page that has the block `kernels`, `scenes` or that of the suite (docs/results.md); charts go to img/ beside
+    it, of a suite a page with pictures too."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Suite:
     suite: Annotated[str, arg(metavar="sparse|paper|smoke")]
     """Which one: gsopt/benchmark/suites has their declarations."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="FILE.json")]
-    """Result file, written after every run; at the end FILE.md and FILE.html are drawn beside it."""
+    """Result file, written after every run; at the end FILE.html is drawn beside it."""
     root: Annotated[Path | None, arg(metavar="DATA")] = None
     """Folder that holds the suite's scenes; smoke brings its own."""
     seeds: int = 3
@@ -102,7 +103,7 @@ class Suite:
 def main(argv: Sequence[str]) -> int:
     """Measure or draw, say where it went, and return 0. `--suite` needs no word before it."""
     if any(word.partition("=")[0] == "--suite" for word in argv) and argv[0].startswith("-"):
-        return suite(tyro.cli(Suite, prog="gsopt bench", args=list(argv)), argv)
+        return suite(tyro.cli(Suite, prog="gsopt bench", args=list(argv)))
     verbs: dict[str, Any] = {"kernels": Kernels, "scenes": Scenes, "draw": Draw}
     flags = tyro.extras.subcommand_cli_from_dict(verbs, prog="gsopt bench", description=__doc__, args=list(argv))
     if isinstance(flags, Draw):
@@ -222,7 +223,7 @@ def run_line(record: dict[str, Any]) -> str:
     )
 
 
-def suite(flags: Suite, argv: Sequence[str]) -> int:
+def suite(flags: Suite) -> int:
     """`gsopt bench --suite`: 0, or 3 when some runs failed."""
     check.within("--seeds", flags.seeds, 1, 1000, "3 is usual.")
     check.within("--threads", flags.threads, 1, 256, "The figures do not depend on it.")
@@ -234,27 +235,53 @@ def suite(flags: Suite, argv: Sequence[str]) -> int:
     cases = list(declared.cases(part, flags.seeds, flags.arms))
     root = declared.find_root(part, flags.root)
 
+    from gsopt.benchmark import suite_file
     from gsopt.benchmark.suite_bench import run_suite, work_folder
+    from gsopt.benchmark.suite_html import write_html
     from gsopt.benchmark.suite_run import Bench
 
     output = flags.output.absolute()
     bench = Bench(root, work_folder(output), flags.threads, flags.prior, flags.llm, flags.model)
-    command = "gsopt bench " + shlex.join(argv)
+    command = suite_command(flags)
     failed = run_suite(output, whole.name, command, cases, bench, lambda text: print(text, flush=True))
-    print(f"Written: {flags.output}")
+    drawn = output.with_suffix(".html")
+    write_html(suite_file.read(output), suite_file.read_pictures(output), drawn)
+    print(f"Written: {output}, {drawn}")
     return InputError.exit_code if failed else 0
+
+
+def suite_command(flags: Suite) -> str:
+    """The call as it stands with the results: folders of this machine say nothing to others."""
+    words = ["gsopt", "bench", "--suite", flags.suite, *(("--root", "DATA") if flags.root else ())]
+    words += ["--seeds", str(flags.seeds), *(("--arms", *flags.arms) if flags.arms else ())]
+    words += ["--groups", *flags.groups] if flags.groups else []
+    words += ["--prior", Path(flags.prior).name] if flags.prior else []
+    return shlex.join([*words, "-o", flags.output.name])
 
 
 def draw(flags: Draw) -> int:
     """`gsopt bench draw`."""
     from gsopt.benchmark import kernel_page, results, scene_page, schema
 
-    if "runs" in results.parsed(flags.json):
+    document = results.parsed(flags.json)
+    if "suite" in document:
+        draw_suite(flags)
+    elif "runs" in document:
         scene_page.write_page(results.read(flags.json, schema.SCENES), flags.page)
     else:
         kernel_page.write_page(results.read(flags.json), flags.page)
     print(f"Written: {flags.page}")
     return 0
+
+
+def draw_suite(flags: Draw) -> None:
+    """The block of the suite in the page, its charts and the grid of pictures beside it, and the page of its own."""
+    from gsopt.benchmark import suite_file, suite_html, suite_page
+
+    document, pictures = suite_file.read(flags.json), suite_file.read_pictures(flags.json)
+    suite_page.write_page(document, flags.page)
+    suite_html.write_grid(document, pictures, flags.page.parent / "img" / f"suite-{document['suite']}.jpg")
+    suite_html.write_html(document, pictures, flags.page.with_name(f"{flags.page.stem}-{document['suite']}.html"))
 
 
 def read_threads(text: str) -> list[int]:
