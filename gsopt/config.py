@@ -90,6 +90,9 @@ class OptimizerConfig:
     """Of the base colour."""
     lr_shN: float = 2.5e-4
     """Of the view-dependent colour."""
+    lr_last: float = 0.1
+    """Share of every rate that is left at the last step: rates fall to it over the last 5 % of a run, but for runs with
+    few views. 1 leaves them."""
     beta1: float = 0.9
     """Decay of Adam's mean gradient."""
     beta2: float = 0.999
@@ -105,6 +108,7 @@ class OptimizerConfig:
         for name in ("means", "means_final", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
             value = getattr(self, f"lr_{name}")
             check.within(f"--optimizer.lr-{name}".replace("_", "-"), value, 0.0, MOST, "Drop the flag for the default.")
+        check.within("--optimizer.lr-last", self.lr_last, 1e-6, 1.0, "Drop the flag for the default.")
         check.within("--optimizer.beta1", self.beta1, 0.0, 0.999999, "The default is 0.9.")
         check.within("--optimizer.beta2", self.beta2, 0.0, 0.999999, "The default is 0.999.")
         check.within("--optimizer.eps", self.eps, 1e-38, 1.0, "The default is 1e-15.")

@@ -11,6 +11,7 @@ PLAIN = (
     *("--init-count", "100000"),
     *("--optimizer.lr-means", "1.6e-4"),
     *("--optimizer.lr-means-final", "1.6e-6"),
+    *("--optimizer.lr-last", "1"),
     *("--optimizer.lr-log-scales", "5e-3"),
     *("--optimizer.lr-sh0", "2.5e-3"),
     *("--optimizer.lr-shN", "1.25e-4"),

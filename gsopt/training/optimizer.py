@@ -63,9 +63,9 @@ def zeros_like(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: torch.zeros_like(tensor) for name, tensor in gaussians.items()})
 
 
-def learning_rates(config: OptimizerConfig, lr_means: float) -> dict[str, float]:
-    """Rate of every parameter; that of the means comes from the schedule."""
-    rates = {name: float(getattr(config, f"lr_{name}")) for name in PARAMETERS}
+def learning_rates(config: OptimizerConfig, lr_means: float, share: float = 1.0) -> dict[str, float]:
+    """Rate of every parameter, `share` of what is configured; that of the means comes from the schedule as it is."""
+    rates = {name: share * float(getattr(config, f"lr_{name}")) for name in PARAMETERS}
     return {**rates, "means": lr_means}
 
 

@@ -20,6 +20,8 @@ GAUSSIANS_PER_PIXEL = 1.44
 SMALLEST_BUDGET, LARGEST_BUDGET = 20_000, 1_000_000
 # A reset takes about this many steps to heal: none is made so late that the run would end with its scar.
 STEPS_AFTER_RESET = 2000
+# Share of a run in which the rates fall, so that it does not end in the noise of the last few views it drew.
+SETTLING = 0.05
 # Floaters: distance to the neighbours beyond the mean, in standard deviations, at the first and at the last step.
 FLOATER_SIGMAS = (4.0, 2.0)
 
@@ -69,6 +71,18 @@ def lr_means(step: int, iterations: int, config: OptimizerConfig, extent: float)
     if first <= 0 or last <= 0:
         return 0.0
     return extent * first * (last / first) ** (step / iterations)
+
+
+def settling_steps(config: TrainConfig, views: int) -> int:
+    """How many of the last steps have falling rates. None with few views: there the noise of single steps keeps those
+    views from being learned by heart (docs/decisions/0001-schedule.md)."""
+    return 0 if is_sparse(config, views) else math.ceil(SETTLING * config.iterations)
+
+
+def lr_share(step: int, last: int, settling: int, config: OptimizerConfig) -> float:
+    """Share of the rates at a step of a run that ends with step `last`: 1, then log-linearly down to `lr_last`."""
+    into = step - (last - settling)
+    return 1.0 if into <= 0 else float(config.lr_last ** (into / settling))
 
 
 def coarse_until(config: TrainConfig, views: int) -> tuple[int, ...]:

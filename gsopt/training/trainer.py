@@ -72,11 +72,12 @@ class Trainer:
         self.backend = backend
         self.step = 0
         self.shown = Shown()
-        self.finished_early = False
         self._spent: Gradients | None = None  # the last step's gradients: their memory serves again
         self._guidance = guidance
         self.poses = PoseRefinement(config.poses, scene, config.iterations) if config.poses.refine else None
         self._sparse = schedule.is_sparse(config, views)
+        self._settling = schedule.settling_steps(config, views)
+        self._last = config.iterations
         self._weights = schedule.weights(config, views)
         self._max_sh_degree = schedule.max_sh_degree(config, views)
         self._generators = generators(config.seed)
@@ -123,7 +124,7 @@ class Trainer:
         self._update(gradients, settings.sh_degree)
         self._change_set()
         self._resting.note(index, loss)
-        self.finished_early = self._is_flat(loss)
+        self._end_when_flat(loss)
         return loss, self.scene.train[index].name
 
     def _rests(self, index: int) -> bool:
@@ -138,7 +139,7 @@ class Trainer:
         """A step that computes nothing: its view's last loss, and its name."""
         loss = float(self._resting.last[index])
         self._change_set()
-        self.finished_early = self._is_flat(loss)
+        self._end_when_flat(loss)
         return loss, self.scene.train[index].name
 
     def settings(self) -> RasterSettings:
@@ -197,8 +198,9 @@ class Trainer:
     def _update(self, gradients: Gradients, sh_degree: int) -> None:
         """Adam, then what density control adds to a step."""
         config = self.config.optimizer
-        lr_means = schedule.lr_means(self.step, self.config.iterations, config, self._extent)
-        rates = learning_rates(config, lr_means)
+        share = schedule.lr_share(self.step, self._last, self._settling, config)
+        lr_means = share * schedule.lr_means(self.step, self.config.iterations, config, self._extent)
+        rates = learning_rates(config, lr_means, share)
         adam_step(self.model, gradients, rates, config, self.backend, sh_degree=sh_degree)
         self._density.after_step(self.model, lr_means)
 
@@ -231,16 +233,24 @@ class Trainer:
             mse = target.share * float(torch.nn.functional.mse_loss(rendered, target.colors))
             shown.mse = mse if shown.mse is None else (1 - NEWS) * shown.mse + NEWS * mse
 
-    def _is_flat(self, loss: float) -> bool:
-        """Whether the run may end here; counts only after the last refinement and band."""
+    @property
+    def finished_early(self) -> bool:
+        """Whether the run is over though its iterations are not."""
+        return self._last <= self.step < self.config.iterations
+
+    def _end_when_flat(self, loss: float) -> None:
+        """Let the run settle and end once its loss is flat; counts only after the last refinement and band."""
         config = self.config
+        if not config.schedule.stop_when_flat or self._last < config.iterations:
+            return
         settled = max(
             schedule.refine_stop(config.density, config.iterations),
             self._max_sh_degree * config.optimizer.sh_degree_every,
             *self._coarse_until,
             0,
         )
-        return config.schedule.stop_when_flat and self.step > settled and self._flatness.update(loss)
+        if self.step > settled and self._flatness.update(loss):
+            self._last = min(config.iterations, self.step + self._settling)
 
     @staticmethod
     def resumed(
@@ -273,7 +283,7 @@ class Trainer:
             "adam_steps": self.model.steps,
             "epoch_position": self._order.position,
             "flatness": {field.name: getattr(self._flatness, field.name) for field in fields(self._flatness)},
-            "finished_early": self.finished_early,
+            "last": self._last,
             "shown": {"loss": self.shown.loss, "mse": self.shown.mse},
         }
         if self._guidance is not None:
@@ -299,7 +309,7 @@ class Trainer:
             generator.set_state(tensors[f"rng.{name}"])
         self._order.restore(tensors["epoch.order"], int(meta["epoch_position"]))
         self._flatness = schedule.Flatness(**meta["flatness"])
-        self.finished_early = bool(meta["finished_early"])
+        self._last = int(meta["last"])
         self.shown = Shown(**meta["shown"])
         self.step = int(meta["step"])
 

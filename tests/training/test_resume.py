@@ -24,7 +24,7 @@ from gsopt.config import (
 )
 from gsopt.errors import UsageError
 from gsopt.events import read_events
-from gsopt.training import loop
+from gsopt.training import loop, schedule
 from gsopt.training.checkpoint import read_checkpoint, saved
 from gsopt.training.loop import train
 from gsopt.training.trainer import Trainer
@@ -246,3 +246,5 @@ def test_early_end_is_remembered(dataset: Path, tmp_path: Path, monkeypatch: pyt
     assert not first.stopped
     again = train(config, tmp_path / "run", resume=True)
     assert again.steps == 26
+    many = replace(config, sparse=replace(config.sparse, below_views=0))
+    assert train(many, tmp_path / "many").steps == 26 + schedule.settling_steps(many, 4)

@@ -104,6 +104,18 @@ def test_a_flat_loss_ends_a_run_and_a_falling_one_never_does() -> None:
     assert not any(falling.update(0.99 ** (step / 10)) for step in range(5000))
 
 
+def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
+    config = TrainConfig(iterations=1000)
+    settling = schedule.settling_steps(config, views=100)
+    assert settling == 50
+    shares = [schedule.lr_share(step, 1000, settling, config.optimizer) for step in range(1, 1001)]
+    assert set(shares[:950]) == {1.0}
+    assert all(a > b for a, b in itertools.pairwise(shares[949:]))
+    assert shares[-1] == pytest.approx(config.optimizer.lr_last)
+    few = schedule.settling_steps(config, views=config.sparse.below_views)
+    assert schedule.lr_share(1000, 1000, few, config.optimizer) == 1.0
+
+
 def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
     short, long = TrainConfig(iterations=7000), TrainConfig(iterations=28_000)
     assert schedule.max_gaussians(short, 50_000) == 72_000
