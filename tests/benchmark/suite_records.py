@@ -14,15 +14,6 @@ MACHINE = {
     "commit": None,
     "load": 1.0,
 }
-    "cpu": "c",
-    "cores": 2,
-    "system": "s",
-    "python": "3",
-    "torch": "2",
-    "gsopt": "0",
-    "commit": None,
-    "load": 1.0,
-}
 
 
 def record(arm: str, psnr: float, scene: str = "objects/a", seed: int = 0, steps: int = 2000) -> dict[str, Any]:
