@@ -28,7 +28,7 @@ from gsopt.gaussians import PARAMETERS
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
-from gsopt.raster.cpu_backend import ISA_VARIABLE
+from gsopt.raster.cpu_backend import ISA_VARIABLE, CpuBackend
 from gsopt.raster.reference import ReferenceBackend, extents, project
 
 ORACLE = ReferenceBackend()
@@ -239,6 +239,26 @@ def everything(engine: Backend, case: Case) -> list[Tensor]:
     loss = engine.photometric(frame.colors, images(35, 67)[1], 0.2)
     tensors = [frame.colors, frame.alphas, frame.depths, frame.radii, loss.v_colors, torch.tensor([loss.l1, loss.ssim])]
     return tensors + [getattr(gradients, field.name) for field in fields(Gradients)]
+
+
+@pytest.mark.parametrize("isa", _cpu.instruction_sets())
+def test_what_the_kernels_skip_changes_no_bit(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But the work: pairs of a splat and a tile that are listed, and pairs of a splat and a pixel that are blended."""
+    monkeypatch.setenv(ISA_VARIABLE, isa)
+    case = single(make_case(5, count=2000, width=67, height=35))
+
+    def drawn_with(tiles: bool, terminated: bool) -> tuple[list[Tensor], int]:
+        engine = built("cpu")
+        assert isinstance(engine, CpuBackend)
+        workspace = engine._workspace
+        workspace.skip_tiles, workspace.skip_terminated, workspace.count_work = tiles, terminated, True
+        return everything(engine, case), workspace.work[0]
+
+    skipping, least = drawn_with(True, True)
+    for tiles, terminated in ((False, True), (True, False), (False, False)):
+        whole, work = drawn_with(tiles, terminated)
+        assert all(torch.equal(one, other) for one, other in zip(skipping, whole, strict=True)), (tiles, terminated)
+        assert work > least
 
 
 @pytest.mark.parametrize("isa", _cpu.instruction_sets())

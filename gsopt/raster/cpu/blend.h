@@ -65,8 +65,9 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
     const int n = end - first < kChunk ? static_cast<int>(end - first) : kChunk;
     load_chunk(frame, frame.entries.as<Entry>() + first, n, geometry, local, touched);
     for (int i = 0; i < n && alive; ++i, ++k) {
-      masks[k] = touched[i] & alive;
-      alive &= ~blend_splat<Depth, Count>(local, i, static_cast<int>(k - begin) + 1, masks[k], states, work);
+      masks[k] = (frame.skips.tiles ? touched[i] : ~0u) & alive;
+      const uint32_t finished = blend_splat<Depth, Count>(local, i, static_cast<int>(k - begin) + 1, masks[k], states, work);
+      if (frame.skips.termination) alive &= ~finished;
     }
   }
   std::memset(masks + k, 0, sizeof(uint32_t) * (end - k));

@@ -57,12 +57,19 @@ struct ParameterGradients {
   float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;  // last may be null
 };
 
+// What a frame does not compute because no pixel would change; each can be switched off, to see what it is worth.
+struct Skips {
+  bool tiles = true;        // a splat is listed only in the tiles, and drawn only in the blocks, that its ellipse reaches
+  bool termination = true;  // a block takes no more splats once all its pixels are opaque
+};
+
 struct Frame {
   Camera camera;
   float background[3];
   int sh_degree = 0, tiles_x = 0, tiles_y = 0;
   int64_t count = 0, visible = 0, intersections = 0;
   bool depth = false;
+  Skips skips;
   Buffer records;            // Record[count]
   Buffer keys, order;        // uint32[count]: depth bits, ids, sorted front to back
   Buffer keys2, order2;      // scratch of the sort

@@ -70,6 +70,7 @@ struct Workspace {
   Buffer scratch;
   int64_t max_entries = UINT32_MAX;  // (splat, tile) pairs of one frame
   bool count_work = false;
+  Skips skips;
   Work work;                              // summed over frames while count_work is set
   std::map<std::string, double> seconds;  // wall time per stage since construction
   std::map<std::string, double> cpu_seconds;  // the same in CPU time of the whole process
@@ -157,7 +158,7 @@ void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, con
   nb::gil_scoped_release release;
   frame.camera = camera;
   frame.background[0] = std::get<0>(background), frame.background[1] = std::get<1>(background), frame.background[2] = std::get<2>(background);
-  frame.sh_degree = sh_degree, frame.count = P.count;
+  frame.sh_degree = sh_degree, frame.count = P.count, frame.skips = ws.skips;
   frame.tiles_x = (camera.width + kTile - 1) / kTile, frame.tiles_y = (camera.height + kTile - 1) / kTile;
   if (frame.tiles_x > 65535 || frame.tiles_y > 65535) throw std::invalid_argument("the image is wider or higher than 1,048,560 pixels");
   reserve_frame(frame, P.count);
@@ -232,6 +233,8 @@ NB_MODULE(_cpu, m) {
       .def("calibrate", [](const Workspace& w) { const Calibration c = w.kernels->calibrate(); return std::tuple(c.fma, c.exp); })
       .def_rw("count_work", &Workspace::count_work)
       .def_rw("max_entries", &Workspace::max_entries)
+      .def_prop_rw("skip_tiles", [](const Workspace& w) { return w.skips.tiles; }, [](Workspace& w, bool on) { w.skips.tiles = on; })
+      .def_prop_rw("skip_terminated", [](const Workspace& w) { return w.skips.termination; }, [](Workspace& w, bool on) { w.skips.termination = on; })
       .def_prop_ro("work", [](const Workspace& w) { return std::tuple(w.work.entries, w.work.pairs); })
       .def_prop_ro("threads", [](const Workspace& w) { return w.pool.threads(); });
   nb::class_<Frame>(m, "Frame")

@@ -74,7 +74,7 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
   uint64_t tiles[kLanes];
   for (int l = 0; l < lanes; ++l)
     if (mask >> l & 1) boxes[l] = tile_box(frame, out[0][l], out[1][l], rad[0][l], rad[1][l]);
-  if (mask) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);
+  if (mask && frame.skips.tiles) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);
   Record* records = frame.records.as<Record>();
   int found = 0;
   for (int l = 0; l < lanes; ++l) {

@@ -75,6 +75,11 @@ template <class Visit> inline void for_each_tile_of_box(const Frame& frame, cons
 
 // Calls visit(tile) for every tile of a splat, row by row.
 template <class Visit> inline void for_each_tile(const Frame& frame, const Record& r, Visit&& visit) {
+  if (!frame.skips.tiles) {
+    for (int y = r.y0; y < r.y1; ++y)
+      for (int x = r.x0; x < r.x1; ++x) visit(y * frame.tiles_x + x);
+    return;
+  }
   if (!TileBox{r.x0, r.x1, r.y0, r.y1}.masked()) return for_each_tile_of_box(frame, r, visit);
   const int corner = r.y0 * frame.tiles_x + r.x0;
   for (uint64_t rest = r.tiles; rest; rest &= rest - 1) {
