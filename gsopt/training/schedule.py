@@ -98,7 +98,8 @@ def max_gaussians(config: TrainConfig, pixels: float) -> int:
     """The budget as given, or what `pixels`, those of an image that show something, can use in a run this long."""
     if config.density.max_gaussians is not None:
         return config.density.max_gaussians
-    wanted = round(GAUSSIANS_PER_PIXEL * pixels * math.sqrt(config.iterations / 7000))
+    longer = config.iterations / 7000
+    wanted = round(GAUSSIANS_PER_PIXEL * pixels * max(longer, math.sqrt(longer)))
     return min(max(wanted, SMALLEST_BUDGET), LARGEST_BUDGET)
 
 

@@ -119,7 +119,8 @@ def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
 def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
     short, long = TrainConfig(iterations=7000), TrainConfig(iterations=28_000)
     assert schedule.max_gaussians(short, 50_000) == 72_000
-    assert schedule.max_gaussians(long, 50_000) == 2 * schedule.max_gaussians(short, 50_000)
+    assert schedule.max_gaussians(long, 50_000) == 4 * schedule.max_gaussians(short, 50_000)
+    assert schedule.max_gaussians(TrainConfig(iterations=1750), 50_000) == 36_000
     assert schedule.max_gaussians(short, 1) == schedule.SMALLEST_BUDGET
     assert schedule.max_gaussians(short, 1e9) == schedule.LARGEST_BUDGET
     given = TrainConfig(density=DensityConfig(max_gaussians=17))
