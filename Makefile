@@ -80,11 +80,10 @@ build/blender-%/.ready:
 
 # A real window on a virtual screen: wants Blender 4.2 or newer, xvfb and scrot. Pictures go to build/blender-window.
 BLENDER ?= blender
-SPLATS ?= runs/demo/splat.ply
-test-blender-gui:
+test-blender-gui: $(VENV)/.for-demo
 	rm -rf build/blender-window
-	LIBGL_ALWAYS_SOFTWARE=1 xvfb-run -s "-screen 0 1300x1250x24" $(BLENDER) --factory-startup \
-	  --window-geometry 0 0 1300 1250 --python tests/blender/gui.py -- build/blender-window $(SPLATS) gsopt/demo
+	LIBGL_ALWAYS_SOFTWARE=1 OMP_NUM_THREADS=1 xvfb-run -a -s "-screen 0 1300x1250x24" $(BLENDER) --factory-startup \
+	  --gpu-backend opengl --window-geometry 0 0 1300 1250 --python tests/blender/gui.py -- build/blender-window gsopt/demo
 	@cat build/blender-window/found.json; grep -q '"ok": true' build/blender-window/found.json
 
 # dist/gsopt-<version>.zip, to be installed in Blender's preferences.

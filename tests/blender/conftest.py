@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "llm_prompts")]
 
 from made_splats import random_splats  # noqa: E402
 
@@ -26,3 +28,21 @@ def odd_folder(tmp_path: Path) -> Path:
     folder = tmp_path / "мой проект 春 $(x) 'q'"
     folder.mkdir()
     return folder
+
+
+@pytest.fixture
+def panel(tmp_path: Path) -> Iterator[Any]:
+    """An empty scene with the extension enabled; its settings."""
+    bpy = pytest.importorskip("bpy", reason="Blender's module is not installed (pip install bpy)")
+    import blender_addon
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    entry = bpy.context.preferences.addons.new()
+    entry.module = "blender_addon"
+    blender_addon.register()
+    try:
+        bpy.context.scene.gsopt.folder = str(tmp_path / "work")
+        yield bpy.context.scene.gsopt
+    finally:
+        blender_addon.unregister()
+        bpy.context.preferences.addons.remove(entry)

@@ -1,7 +1,9 @@
-"""The whole way in one Blender without a window: mesh, dataset, prompts, run, stop, re-attach, import, filter, export.
+"""The whole way in Blenders without a window: mesh, dataset, prompts, run, and in the middle of it Blender dies. The
+next one finds the run, stops it, goes on with it, imports, filters, exports.
 
     blender -b --factory-startup -P tests/blender/end_to_end.py -- WORK [MESH]
-    python tests/blender/end_to_end.py -- WORK [MESH]          (a Python with the module bpy)
+    blender -b --factory-startup -P tests/blender/end_to_end.py -- WORK --again
+    (or with a Python that has the module bpy: python tests/blender/end_to_end.py -- ...)
 
 Prints what it found as one line of JSON, beginning with `found `. Every step is an operator of the panel.
 """
@@ -9,8 +11,9 @@ Prints what it found as one line of JSON, beginning with `found `. Every step is
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ import bpy  # noqa: E402
 import blender_addon  # noqa: E402
 
 VIEWS, TEST_VIEWS, SIZE = 6, 2, 48
+SCENE = "scene.blend"
 
 
 def call(operator: Any, **settings: Any) -> None:
@@ -60,19 +64,21 @@ def write_prompts(settings: Any, work: Path) -> list[str]:
     return [entry.text for entry in settings.prompts]
 
 
-def run_and_stop(found: dict[str, Any]) -> None:
-    """Launch, see events come, save and open the file again in the middle, stop, go on, stop."""
+def launch(found: dict[str, Any]) -> None:
     settings = bpy.context.scene.gsopt
     call(bpy.ops.gsopt.launch, wait=False)
     call(bpy.ops.gsopt.follow, step=20, seconds=1800.0)
     found["seen running"] = [settings.run_status, settings.run_step, settings.run_total, settings.run_count]
-    path = str(Path(settings.folder) / "scene.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    bpy.ops.wm.save_as_mainfile(filepath=str(Path(settings.folder) / SCENE))
+
+
+def find_again(found: dict[str, Any], work: Path) -> None:
+    """Open the file of the Blender that died; stop the run, go on with it, stop it again."""
+    bpy.ops.wm.open_mainfile(filepath=str(work / SCENE))
     settings = bpy.context.scene.gsopt
+    found["saved"] = [settings.run_status, settings.run_step, [entry.text for entry in settings.prompts]]
     call(bpy.ops.gsopt.follow, step=settings.run_step + 5, seconds=1800.0)
-    found["re-attached"] = [settings.run_status, settings.run_step, bool(settings.run_job)]
+    found["found again"] = [settings.run_status, settings.run_step]
     call(bpy.ops.gsopt.stop)
     found["stopped"] = [settings.run_status, settings.run_step]
     settings.run_status = ""
@@ -102,25 +108,35 @@ def inspect(found: dict[str, Any], work: Path) -> None:
     bpy.ops.wm.save_mainfile()
 
 
-def main(work: Path, mesh: Path | None) -> None:
-    bpy.ops.wm.read_factory_settings(use_empty=False)
-    blender_addon.register()
+def until_it_dies(work: Path, mesh: Path | None) -> None:
     bring_mesh(mesh)
-    settings, began = prepare(work), time.time()
+    settings = prepare(work)
     found: dict[str, Any] = {"blender": bpy.app.version_string}
     call(bpy.ops.gsopt.test)
     found["doctor"] = settings.doctor
     call(bpy.ops.gsopt.render_dataset)
     found["dataset"] = settings.job_dataset.message
     found["prompts"] = write_prompts(settings, work)
-    run_and_stop(found)
+    launch(found)
+    print("found " + json.dumps(found), flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def again(work: Path) -> None:
+    found: dict[str, Any] = {}
+    find_again(found, work)
     inspect(found, work)
     blender_addon.unregister()
     found["left behind"] = [name for name in ("Scene", "Object") if hasattr(getattr(bpy.types, name), "gsopt")]
-    found["seconds"] = round(time.time() - began, 1)
     print("found " + json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":
     words = sys.argv[sys.argv.index("--") + 1 :]
-    main(Path(words[0]).absolute(), Path(words[1]).absolute() if len(words) > 1 else None)
+    folder = Path(words[0]).absolute()
+    bpy.ops.wm.read_factory_settings(use_empty=False)
+    blender_addon.register()
+    if words[1:] == ["--again"]:
+        again(folder)
+    else:
+        until_it_dies(folder, Path(words[1]).absolute() if len(words) > 1 else None)

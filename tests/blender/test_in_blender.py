@@ -1,56 +1,19 @@
-"""The half that needs Blender: what comes in goes out the same, filters hide what they say, faults end in a message."""
+"""Splats in Blender: what comes in goes out the same, each display shows it, filters hide what they say."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from in_panel import bring_in, event, fails_with
 from made_splats import random_splats
 
 from blender_addon.core.ply import read_ply, write_ply
 
 SHOWN = {"Points": 0, "Spheres": 0, "Ellipsoids": 100, "Gaussians": 100}
-
-
-@pytest.fixture
-def panel(tmp_path: Path) -> Iterator[Any]:
-    """An empty scene with the extension enabled; its settings."""
-    bpy = pytest.importorskip("bpy", reason="Blender's module is not installed (pip install bpy)")
-    import blender_addon
-
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    entry = bpy.context.preferences.addons.new()
-    entry.module = "blender_addon"
-    blender_addon.register()
-    try:
-        bpy.context.scene.gsopt.folder = str(tmp_path / "work")
-        yield bpy.context.scene.gsopt
-    finally:
-        blender_addon.unregister()
-        bpy.context.preferences.addons.remove(entry)
-
-
-def bring_in(path: Path, count: int = 100) -> Any:
-    """Splats as an object, through the operator."""
-    import bpy
-
-    write_ply(path, random_splats(count))
-    assert bpy.ops.gsopt.import_splats(filepath=str(path)) == {"FINISHED"}
-    return bpy.context.view_layer.objects.active
-
-
-def fails_with(said: str, operator: Any, **settings: Any) -> None:
-    """The operator is cancelled with a message in the panel; in a script that is a RuntimeError."""
-    import bpy
-
-    with pytest.raises(RuntimeError, match="Error: "):
-        operator(**settings)
-    assert said in bpy.context.scene.gsopt.message
-    assert "Traceback" not in bpy.context.scene.gsopt.message
 
 
 def test_what_comes_in_goes_out_the_same(panel: Any, odd_folder: Path) -> None:
@@ -148,105 +111,6 @@ def test_cameras_look_where_the_poses_say(panel: Any, tmp_path: Path) -> None:
     assert tuple(seen)[:2] == pytest.approx(expected, abs=1e-4)
 
 
-def test_prompts_stay_in_the_blend_and_in_the_file(panel: Any, tmp_path: Path) -> None:
-    import bpy
-
-    made = {"source": "llm:qwen", "raw": "raw.txt"}
-    prompts = [
-        {"text": "春", "weight": 0.5, "view": "back", "polarity": "negative", "source": "llm:qwen", "score": 0.25}
-    ]
-    (tmp_path / "a.json").write_text(json.dumps({"version": 1, "made": made, "prompts": prompts}))
-    bpy.ops.gsopt.prompts_read(filepath=str(tmp_path / "a.json"))
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.gsopt.prompts_write(filepath=str(tmp_path / "b.json"))
-    written = json.loads((tmp_path / "b.json").read_text(encoding="utf-8"))
-    assert written == {"version": 1, "made": made, "prompts": [{**prompts[0], "rationale": ""}]}
-
-
-def test_proposals_are_taken_one_by_one(panel: Any) -> None:
-    import bpy
-
-    for text in ("one", "two", "three", "four"):
-        panel.proposals.add().text = text
-    bpy.ops.gsopt.proposal(accept=True)
-    bpy.ops.gsopt.proposal(accept=False)
-    panel.proposals[0].text = "three, edited"
-    bpy.ops.gsopt.proposal(accept=True, all=True)
-    assert [entry.text for entry in panel.prompts] == ["one", "three, edited", "four"]
-    fails_with("no proposal", bpy.ops.gsopt.proposal)
-
-
-def test_faults_end_in_a_message(panel: Any, tmp_path: Path) -> None:
-    import bpy
-
-    write_ply(tmp_path / "a.ply", random_splats(5, 0))
-    (tmp_path / "lies.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(b"vertex 5", b"vertex 999"))
-    settings = bpy.context.preferences.addons["blender_addon"].preferences
-    fails_with("claims 999 rows", bpy.ops.gsopt.import_splats, filepath=str(tmp_path / "lies.ply"))
-    fails_with("neither .ply nor .spz", bpy.ops.gsopt.import_splats, filepath=str(tmp_path / "a.obj"))
-    fails_with("holds no splats yet", bpy.ops.gsopt.import_splats, filepath=str(tmp_path))
-    fails_with("holds no run", bpy.ops.gsopt.attach, directory=str(tmp_path))
-    fails_with("Nothing to render", bpy.ops.gsopt.render_dataset)
-    fails_with("no dataset", bpy.ops.gsopt.launch)
-    fails_with("No run is going on", bpy.ops.gsopt.stop)
-    fails_with("notes are empty", bpy.ops.gsopt.propose)
-    fails_with("No splats are named", bpy.ops.gsopt.import_splats)
-    settings.interpreter = str(tmp_path / "no python")
-    fails_with("not there or not a program", bpy.ops.gsopt.test)
-    wrong = tmp_path / "wrong python"
-    wrong.write_text("#!/bin/sh\necho 'No module named gsopt'; exit 1\n")
-    wrong.chmod(0o755)
-    settings.interpreter = str(wrong)
-    fails_with("No module named gsopt", bpy.ops.gsopt.test)
-    other = {"gsopt": "9.1", "rasterizer": {"isa": "x", "backend": "x", "ms_per_step": 1, "problem": None}}
-    wrong.write_text(f"#!/bin/sh\necho '{json.dumps(other)}'\n")
-    fails_with("gsopt 9.1, this extension knows", bpy.ops.gsopt.test)
-
-
-def event(kind: str, **fields: Any) -> str:
-    return json.dumps({"v": 1, "seq": 0, "kind": kind, "time": 1.8e9, **fields}) + "\n"
-
-
-@pytest.mark.parametrize(
-    ("log", "status", "said"),
-    [
-        (event("started", pid=2**22 + 1, total=9, step=0), "killed", "Resume"),
-        (
-            event("started", pid=1, total=9) + event("error", message="The disk is full. Free some space."),
-            "error",
-            "disk",
-        ),
-        (event("started", pid=1, total=9).replace('"v": 1', '"v": 7'), "unreadable", "protocol version 7"),
-        ("garbage\n" * 10 + event("done", step=9), "done", ""),
-        (event("done", step=9) + '{"v": 1, "seq": 3, "ki', "done", ""),
-    ],
-)
-def test_whatever_a_run_left_behind_is_told(panel: Any, tmp_path: Path, log: str, status: str, said: str) -> None:
-    import bpy
-
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "events.jsonl").write_text(log)
-    bpy.ops.gsopt.attach(directory=str(run))
-    bpy.ops.gsopt.follow(seconds=20.0)
-    assert panel.run_status == status
-    assert said in panel.run_message
-
-
-def test_a_program_that_dies_at_once_is_told(panel: Any, tmp_path: Path) -> None:
-    import bpy
-
-    (tmp_path / "data").mkdir()
-    panel.dataset, panel.source = str(tmp_path / "data"), "DATASET"
-    wrong = tmp_path / "python"
-    wrong.write_text("#!/bin/sh\necho 'gsopt: There is no scene in it. Give another.'; exit 3\n")
-    wrong.chmod(0o755)
-    bpy.context.preferences.addons["blender_addon"].preferences.interpreter = str(wrong)
-    fails_with("There is no scene in it", bpy.ops.gsopt.launch)
-    assert panel.run_status == "error"
-
-
 def test_live_previews_replace_each_other_in_short_ticks(panel: Any, tmp_path: Path) -> None:
     import bpy
 
@@ -281,3 +145,55 @@ def test_enabling_and_disabling_leaves_nothing_behind(panel: Any) -> None:
         assert not bpy.app.timers.is_registered(watching.tick)
         assert not [name for name in dir(bpy.types) if name.startswith("GSOPT_")]
         blender_addon.register()
+
+
+def test_an_edited_export_has_the_picture_of_what_was_kept(panel: Any, tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    import bpy
+    from mathutils import Matrix
+
+    import gsopt
+
+    thing = bring_in(tmp_path / "a.ply")
+    thing.matrix_world = Matrix.Rotation(0.7, 4, "X") @ Matrix.Scale(3.0, 4)
+    panel.least_opacity = 0.4
+    bpy.ops.gsopt.filter()
+    bpy.ops.gsopt.delete_hidden()
+    bpy.ops.gsopt.export(filepath=str(tmp_path / "b.ply"))
+    before, after = (gsopt.load_splats(tmp_path / name) for name in ("a.ply", "b.ply"))
+    kept = before.opacities >= 0.4
+    eyes = torch.tensor([[0.0, 1.0, -6.0]])
+    lens = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]])
+    cameras = gsopt.Cameras(gsopt.cameras.look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), lens, 48, 48)
+    pictures = [gsopt.rasterize(splats, cameras).colors for splats in (before.select(kept), after)]
+    assert pictures[0].max() > 0.2
+    assert torch.allclose(*pictures, atol=1e-5)
+
+
+def test_each_scene_gets_what_it_asked_for(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    from blender_addon import watching
+
+    write_ply(tmp_path / "a.ply", random_splats(10))
+    write_ply(tmp_path / "b.ply", random_splats(20))
+    scenes = [bpy.context.scene, bpy.data.scenes.new("other")]
+    for scene, name in zip(scenes, ("a.ply", "b.ply"), strict=True):
+        with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
+            bpy.ops.gsopt.import_splats(filepath=str(tmp_path / name), wait=False)
+    scenes[1].name = "renamed meanwhile"
+    assert watching.wait(lambda: not watching._loads, 30)
+    assert [scene.gsopt.job_import.state for scene in scenes] == ["DONE", "DONE"]
+    assert [[len(o.data.vertices) for o in scene.objects] for scene in scenes] == [[10], [20]]
+
+
+def test_an_undo_does_not_lose_a_run(panel: Any) -> None:
+    """Undo brings back the scene's properties of an earlier time; a run has gone on since."""
+    from blender_addon import registration
+
+    panel.run_status, panel.run_path, panel.run_step, panel.job_poses.state = "running", "/runs/a", 40, "RUNNING"
+    registration.before_undo()
+    panel.run_status, panel.run_path, panel.run_step, panel.job_poses.state = "", "", 0, "NONE"
+    registration.after_undo()
+    now = panel.run_status, panel.run_path, panel.run_step, panel.job_poses.state
+    assert now == ("running", "/runs/a", 40, "RUNNING")

@@ -1,0 +1,198 @@
+"""Whatever goes wrong outside ends in a message of the panel."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from in_panel import event, fails_with
+from made_splats import random_splats
+
+from blender_addon.core.ply import write_ply
+
+
+def test_faults_end_in_a_message(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    write_ply(tmp_path / "a.ply", random_splats(5, 0))
+    (tmp_path / "lies.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(b"vertex 5", b"vertex 999"))
+    settings = bpy.context.preferences.addons["blender_addon"].preferences
+    fails_with("claims 999 rows", bpy.ops.gsopt.import_splats, filepath=str(tmp_path / "lies.ply"))
+    fails_with("neither .ply nor .spz", bpy.ops.gsopt.import_splats, filepath=str(tmp_path / "a.obj"))
+    fails_with("holds no splats yet", bpy.ops.gsopt.import_splats, filepath=str(tmp_path))
+    fails_with("holds no run", bpy.ops.gsopt.attach, directory=str(tmp_path))
+    fails_with("Nothing to render", bpy.ops.gsopt.render_dataset)
+    fails_with("no dataset", bpy.ops.gsopt.launch)
+    fails_with("No run is going on", bpy.ops.gsopt.stop)
+    fails_with("notes are empty", bpy.ops.gsopt.propose)
+    fails_with("No splats are named", bpy.ops.gsopt.import_splats)
+    settings.interpreter = str(tmp_path / "no python")
+    fails_with("not there or not a program", bpy.ops.gsopt.test)
+    wrong = tmp_path / "wrong python"
+    wrong.write_text("#!/bin/sh\necho 'No module named gsopt'; exit 1\n")
+    wrong.chmod(0o755)
+    settings.interpreter = str(wrong)
+    fails_with("No module named gsopt", bpy.ops.gsopt.test)
+    other = {"gsopt": "9.1", "rasterizer": {"isa": "x", "backend": "x", "ms_per_step": 1, "problem": None}}
+    wrong.write_text(f"#!/bin/sh\necho '{json.dumps(other)}'\n")
+    fails_with("gsopt 9.1, this extension knows", bpy.ops.gsopt.test)
+
+
+@pytest.mark.parametrize(
+    ("log", "status", "said"),
+    [
+        (event("started", pid=2**22 + 1, total=9, step=0), "killed", "Resume"),
+        (
+            event("started", pid=1, total=9) + event("error", message="The disk is full. Free some space."),
+            "error",
+            "disk",
+        ),
+        (event("started", pid=1, total=9).replace('"v": 1', '"v": 7'), "unreadable", "protocol version 7"),
+        ("garbage\n" * 10 + event("done", step=9), "done", ""),
+        (event("done", step=9) + '{"v": 1, "seq": 3, "ki', "done", ""),
+    ],
+)
+def test_whatever_a_run_left_behind_is_told(panel: Any, tmp_path: Path, log: str, status: str, said: str) -> None:
+    import bpy
+
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "events.jsonl").write_text(log)
+    bpy.ops.gsopt.attach(directory=str(run))
+    bpy.ops.gsopt.follow(seconds=20.0)
+    assert panel.run_status == status
+    assert said in panel.run_message
+
+
+def test_a_program_that_dies_at_once_is_told(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    (tmp_path / "data").mkdir()
+    panel.dataset, panel.source = str(tmp_path / "data"), "DATASET"
+    wrong = tmp_path / "python"
+    wrong.write_text("#!/bin/sh\necho 'gsopt: There is no scene in it. Give another.'; exit 3\n")
+    wrong.chmod(0o755)
+    bpy.context.preferences.addons["blender_addon"].preferences.interpreter = str(wrong)
+    fails_with("There is no scene in it", bpy.ops.gsopt.launch)
+    assert panel.run_status == "error"
+
+
+def stand_in(folder: Path, script: str) -> Path:
+    """A program that is called as gsopt's interpreter would be."""
+    import bpy
+
+    program = folder / "stand-in python"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    bpy.context.preferences.addons["blender_addon"].preferences.interpreter = str(program)
+    return program
+
+
+def test_a_killed_run_is_told_and_can_go_on(panel: Any, tmp_path: Path) -> None:
+    """`-m gsopt train DATA -m RUN` are the first words, `-m gsopt train --resume -m RUN` when it goes on."""
+    import bpy
+
+    from blender_addon.core import job
+
+    (tmp_path / "data").mkdir()
+    panel.dataset, panel.source = str(tmp_path / "data"), "DATASET"
+    begin, end = event("started", pid=0, total=9, step=0), event("done", step=9)
+    (tmp_path / "begin").write_text(begin.replace('"pid": 0', '"pid": PID'))
+    (tmp_path / "end").write_text(end)
+    stand_in(
+        tmp_path,
+        f'if [ "$4" = --resume ]; then cat "{tmp_path}/end" >> "$6/events.jsonl"; exit; fi\n'
+        f'mkdir -p "$6"; sed "s/PID/$$/" "{tmp_path}/begin" > "$6/events.jsonl"; exec sleep 60',
+    )
+    bpy.ops.gsopt.launch(wait=False)
+    bpy.ops.gsopt.follow(step=0, seconds=20.0)
+    from blender_addon import watching
+
+    assert watching.wait(lambda: panel.run_status == "running", 20.0)
+    fails_with("A run is going on", bpy.ops.gsopt.launch)
+    job.end(job.read_job(Path(panel.run_job)), force=True)
+    bpy.ops.gsopt.follow(seconds=20.0)
+    assert panel.run_status == "killed"
+    assert "Resume" in panel.run_message
+    bpy.ops.gsopt.resume()
+    assert panel.run_status == "done"
+
+
+def test_poses_are_found_or_the_reason_is_told(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    (tmp_path / "photos").mkdir()
+    panel.source = "PHOTOS"
+    fails_with("No photos are chosen", bpy.ops.gsopt.find_poses)
+    panel.photos = str(tmp_path / "photos")
+    stand_in(tmp_path, "echo 'gsopt: Only 2 of 9 photos overlap. Take more.'; exit 3")
+    fails_with("Only 2 of 9 photos overlap", bpy.ops.gsopt.find_poses)
+    stand_in(tmp_path, 'mkdir -p "$6"; echo {} > "$6/transforms.json"')
+    bpy.ops.gsopt.find_poses()
+    assert panel.source == "DATASET"
+    assert (Path(panel.dataset) / "transforms.json").is_file()
+
+
+def test_work_can_be_cancelled_and_is_not_begun_twice(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    from blender_addon.core import job
+
+    panel.photos = str(tmp_path)
+    stand_in(tmp_path, "sleep 60")
+    bpy.ops.gsopt.find_poses(wait=False)
+    work = job.read_job(Path(panel.job_poses.folder))
+    assert job.alive(work)
+    fails_with("going on already", bpy.ops.gsopt.find_poses)
+    bpy.ops.gsopt.cancel(kind="poses")
+    assert panel.job_poses.state == "NONE"
+    job._children[work.pid].wait(20)
+    fails_with("no work called", bpy.ops.gsopt.cancel, kind="x")
+
+
+def test_a_folder_that_cannot_be_written_to_is_told(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    (tmp_path / "file").touch()
+    panel.folder, panel.notes = str(tmp_path / "file" / "below"), "lantern"
+    bpy.ops.mesh.primitive_cube_add()
+    stand_in(tmp_path, "exit 0")
+    for operator in (bpy.ops.gsopt.propose, bpy.ops.gsopt.test):
+        fails_with("Choose another folder", operator)
+    bpy.context.preferences.addons["blender_addon"].preferences.checkout = str(Path(__file__).resolve().parents[2])
+    fails_with("Cannot write", bpy.ops.gsopt.render_dataset)
+    assert [scene.name for scene in bpy.data.scenes] == ["Scene"], "the stage is gone"
+
+
+def test_splats_in_edit_mode_are_left_alone(panel: Any, tmp_path: Path) -> None:
+    import bpy
+    from in_panel import bring_in
+
+    bring_in(tmp_path / "a.ply")
+    bpy.ops.object.mode_set(mode="EDIT")
+    for operator in (bpy.ops.gsopt.filter, bpy.ops.gsopt.statistics, bpy.ops.gsopt.delete_hidden):
+        fails_with("Leave Edit Mode", operator)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert bpy.ops.gsopt.statistics() == {"FINISHED"}
+
+
+def test_a_defect_of_ours_is_a_message_and_the_timer_goes_on(
+    panel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import bpy
+
+    from blender_addon import splat_object
+
+    def broken(*_: Any) -> None:
+        raise TypeError("oops")
+
+    write_ply(tmp_path / "a.ply", random_splats(5, 0))
+    monkeypatch.setattr(splat_object, "put", broken)
+    fails_with(
+        "A defect of the extension: TypeError('oops')", bpy.ops.gsopt.import_splats, filepath=str(tmp_path / "a.ply")
+    )
+    assert panel.job_import.state == "FAILED"
+    monkeypatch.undo()
+    assert bpy.ops.gsopt.import_splats(filepath=str(tmp_path / "a.ply")) == {"FINISHED"}
