@@ -46,15 +46,14 @@ def run_suite(path: Path, suite: str, command: str, cases: Sequence[Case], bench
 
 def _one(path: Path, document: dict[str, Any], case: Case, bench: Bench) -> tuple[dict[str, Any], str]:
     """The document after one case, written when it changed, and what there is to tell."""
-    told = ""
+    told, old = "", next((run for run in document["runs"] if suite_file.run_id(run) == case.id), None)
     if (reason := suite_run.reason_to_skip(case, bench)) is not None:
         skip = {**_named(case), "reason": reason}
-        if skip in document["skipped"]:
+        if old is not None or skip in document["skipped"]:  # a record made where a prior was at hand stays
             return document, ""
         document = suite_file.with_skip(document, skip)
     else:
-        key = suite_run.key(case, bench)
-        if any(run["key"] == key and suite_file.run_id(run) == case.id for run in document["runs"]):
+        if old is not None and old["key"] == suite_run.key(case, bench):
             return document, ""
         try:
             record, protocol, pictures = suite_run.measure(case, bench)

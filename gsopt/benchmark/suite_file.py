@@ -143,13 +143,10 @@ def with_run(document: Document, record: Document, machine: Document, protocol: 
     }
 
 
-def with_skip(document: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
-    """The document with this run left out, for the reason told. A record that it may have of the run goes."""
-    return {
-        **document,
-        "runs": [run for run in document["runs"] if run_id(run) != run_id(record)],
-        "skipped": [skip for skip in document["skipped"] if run_id(skip) != run_id(record)] + [record],
-    }
+def with_skip(document: Document, record: Document) -> Document:
+    """The document with this run among those left out, for the reason told."""
+    kept = [skip for skip in document["skipped"] if run_id(skip) != run_id(record)]
+    return {**document, "skipped": [*kept, record]}
 
 
 def pictures_path(path: Path) -> Path:

@@ -15,7 +15,7 @@ import pytest
 import torch
 from finished_runs import FOV, HEIGHT, WHITE, WIDTH, ring, splats
 from PIL import Image
-from suite_records import record
+from suite_records import MACHINE, record
 
 from gsopt import cli, quats
 from gsopt.benchmark import suite, suite_bench, suite_file, suite_judge, suite_key, suite_run
@@ -30,7 +30,8 @@ CASES = [
     for name in ("a", "b")
     for arm in ("3dgs", "ours-0")
 ]
-TIMES = ("setup_cpu_seconds", "train_cpu_seconds", "peak_memory_mb", "load", "curve")
+DIFFERENT = ("setup_cpu_seconds", "train_cpu_seconds", "peak_memory_mb", "load", "curve", "machine")
+"""Times, memory, and the commit, which may move while the tests run."""
 
 
 class Killed(BaseException):
@@ -58,6 +59,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return named, "protocol", {case.id: {"render": "r"}}
 
     monkeypatch.setattr(suite_run, "measure", measure)
+    monkeypatch.setattr(suite_bench, "machine", lambda: MACHINE)
     return ids
 
 
@@ -149,6 +151,16 @@ def test_a_run_that_fails_is_told_and_the_others_are_made(
     assert made[3:] == [CASES[1].id]
 
 
+def test_a_record_outlives_a_machine_that_cannot_make_it(
+    tmp_path: Path, bench: Bench, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go(tmp_path, bench)
+    before = (tmp_path / "r.json").read_bytes()
+    monkeypatch.setattr(suite_run, "reason_to_skip", lambda case, bench: "no prior at hand")
+    go(tmp_path, bench)
+    assert (tmp_path / "r.json").read_bytes() == before
+
+
 def test_training_that_fails_says_why(tmp_path: Path, bench: Bench) -> None:
     bench.work.mkdir()
     with pytest.raises(RunFailed, match=r"exit code 2: .*--iterations.*at least 1, got 0"):
@@ -226,8 +238,8 @@ def test_the_same_run_gives_the_same_figures(smoke: Path, tmp_path: Path) -> Non
     assert cli.main(["bench", "--suite", "smoke", "--seeds", "1", "--arms", "ours-0", "-o", str(file)]) == 0
     first = next(run for run in suite_file.read(smoke)["runs"] if run["arm"] == "ours-0")
     (second,) = suite_file.read(file)["runs"]
-    assert [{k: v for k, v in run.items() if k not in TIMES} for run in (first, second)] == [
-        {k: v for k, v in first.items() if k not in TIMES}
+    assert [{k: v for k, v in run.items() if k not in DIFFERENT} for run in (first, second)] == [
+        {k: v for k, v in first.items() if k not in DIFFERENT}
     ] * 2
     assert [look["psnr"] for look in first["curve"]] == [look["psnr"] for look in second["curve"]]
     pictures = [suite_file.read_pictures(path) for path in (smoke, file)]
