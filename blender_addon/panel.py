@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from . import loading, splat_object
-from .preferences import lines_of
 
 CATEGORY = "gsopt"
 
@@ -64,17 +64,20 @@ class GSOPT_PT_main(Sidebar, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         settings, layout = context.scene.gsopt, self.layout
         if settings.message:
-            tell(layout, settings.message, "ERROR")
+            tell(layout.box(), settings.message, "ERROR")
         values(layout, settings, "folder")
         layout.operator("gsopt.test", text="Test Interpreter", icon="CHECKMARK")
         if settings.doctor:
-            tell(layout, settings.doctor, "INFO")
+            tell(layout.box(), settings.doctor, "INFO")
 
 
-def tell(layout: Any, text: str, icon: str) -> None:
-    box = layout.box().column(align=True)
-    for place, line in enumerate(lines_of(text, 44)[:8]):
-        box.label(text=line, icon=icon if place == 0 else "BLANK1")
+def tell(layout: Any, text: str, icon: str = "NONE", most: int = 8) -> None:
+    """A text in lines that fit into the sidebar."""
+    region, scale = bpy.context.region, bpy.context.preferences.system.ui_scale
+    width = int(region.width / (6.5 * scale)) - 9 if region else 36
+    column = layout.column(align=True)
+    for place, line in enumerate(textwrap.wrap(text, max(20, width))[:most]):
+        column.label(text=line, icon=icon if place == 0 or icon == "NONE" else "BLANK1")
 
 
 def values(layout: Any, owner: Any, *names: str) -> None:
@@ -95,7 +98,7 @@ def show_job(layout: Any, entry: Any, kind: str) -> bool:
             row.operator("gsopt.cancel", text="", icon="CANCEL").kind = kind
         return True
     if entry.state == "FAILED" and entry.message:
-        tell(layout, entry.message, "ERROR")
+        tell(layout.box(), entry.message, "ERROR")
     return False
 
 
@@ -154,8 +157,7 @@ def draw_proposal(layout: Any, settings: Any) -> None:
     row = box.row(align=True)
     for name in ("weight", "view", "polarity"):
         row.prop(entry, name, text="")
-    for line in lines_of(f"{entry.rationale} {score_text(entry.score)}", 44)[:4]:
-        box.label(text=line)
+    tell(box, f"{entry.rationale} {score_text(entry.score)}", most=4)
     row = box.row(align=True)
     row.operator("gsopt.proposal", text="Accept", icon="CHECKMARK").accept = True
     row.operator("gsopt.proposal", text="Reject", icon="X").accept = False
@@ -178,7 +180,10 @@ def draw_prompts(layout: Any, settings: Any) -> None:
     side.operator("gsopt.prompts_read", text="", icon="IMPORT")
     side.operator("gsopt.prompts_write", text="", icon="EXPORT")
     if 0 <= settings.prompt_index < len(settings.prompts):
-        entry, row = settings.prompts[settings.prompt_index], layout.row(align=True)
+        entry = settings.prompts[settings.prompt_index]
+        column = layout.column(align=True)
+        column.prop(entry, "text", text="")
+        row = column.row(align=True)
         for name in ("weight", "view", "polarity"):
             row.prop(entry, name, text="")
 
@@ -222,7 +227,7 @@ def draw_progress(layout: Any, settings: Any) -> None:
     row.label(text=f"{clock(settings.run_eta)} left" if settings.run_eta >= 0 else "")
     layout.label(text=f"{settings.run_count:,} Gaussians")
     if settings.run_message:
-        tell(layout, settings.run_message, "INFO")
+        tell(layout.box(), settings.run_message, "INFO")
     row = layout.row(align=True)
     row.operator("gsopt.stop", icon="PAUSE").kill = False
     if settings.run_job:
@@ -237,8 +242,7 @@ def draw_outcome(layout: Any, settings: Any) -> None:
     box.label(text=f"{Path(settings.run_path).name}: {settings.run_status}")
     if settings.run_step:
         box.label(text=f"step {settings.run_step:,}, {settings.run_count:,} Gaussians")
-    for line in lines_of(settings.run_message, 44)[:6]:
-        box.label(text=line)
+    tell(box, settings.run_message)
     row = box.row(align=True)
     row.operator("gsopt.import_splats", text="Import", icon="IMPORT").from_run = True
     if settings.run_status in ("stopped", "killed", "error"):

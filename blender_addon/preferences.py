@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -47,18 +48,8 @@ class GsoptPreferences(bpy.types.AddonPreferences):
         for name in ("interpreter", "checkout", "folder", "llm", "model"):
             layout.prop(self, name)
         layout.operator("gsopt.test", icon="CHECKMARK")
-        for line in lines_of(context.scene.gsopt.doctor):
+        for line in textwrap.wrap(context.scene.gsopt.doctor, 90):
             layout.label(text=line)
-
-
-def lines_of(text: str, width: int = 90) -> list[str]:
-    """A text in lines that fit."""
-    lines = [""]
-    for word in text.split():
-        if len(lines[-1]) + len(word) > width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return [line for line in lines if line]
 
 
 def preferences(context: Any) -> Any:

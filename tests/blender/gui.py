@@ -80,6 +80,7 @@ def longest_tick(found: dict[str, Any], what: str) -> None:
 def set_up(out: Path) -> None:
     window, area, space, _ = view()
     bpy.context.preferences.view.show_splash = False
+    bpy.context.preferences.system.use_region_overlap = False
     bpy.context.preferences.addons.new().module = "blender_addon"
     blender_addon.register()
     for other in list(bpy.data.objects):
