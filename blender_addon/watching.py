@@ -107,8 +107,8 @@ def tell(entry: Any, **values: Any) -> None:
 # Undo takes scenes back to what they were, but a program that was started goes on.
 
 
-def told(settings: Any) -> Iterator[tuple[Any, str]]:
-    """Where the state of runs and programs stands: owner and name of each property."""
+def lasting(settings: Any) -> Iterator[tuple[Any, str]]:
+    """What no undo may take back, the state of runs and programs: owner and name of each property."""
     for name in settings.bl_rna.properties.keys():  # noqa: SIM118  a collection of Blender's
         if name.startswith("run_"):
             yield settings, name
@@ -118,12 +118,12 @@ def told(settings: Any) -> Iterator[tuple[Any, str]]:
 
 def before_undo() -> None:
     for scene in bpy.data.scenes:
-        _kept[scene.session_uid] = [getattr(owner, name) for owner, name in told(scene.gsopt)]
+        _kept[scene.session_uid] = [getattr(owner, name) for owner, name in lasting(scene.gsopt)]
 
 
 def after_undo() -> None:
     for scene in bpy.data.scenes:
-        for (owner, name), value in zip(told(scene.gsopt), _kept.pop(scene.session_uid, ()), strict=False):
+        for (owner, name), value in zip(lasting(scene.gsopt), _kept.pop(scene.session_uid, ()), strict=False):
             tell(owner, **{name: value})
     watch()
 
@@ -272,7 +272,8 @@ def show_live(scene: Any, mesh: Any, summary: Summary) -> None:
     """Bring the newest splats into the viewport."""
     live = live_object(scene)
     if live is None:
-        add_object(scene, mesh, summary, scene.gsopt.run_path, "Ellipsoids")[LIVE] = 1
+        live = add_object(scene, mesh, summary, scene.gsopt.run_path, "Ellipsoids")
+        live.name, live[LIVE] = f"{Path(scene.gsopt.run_path).name} (live)", 1
     else:
         splat_object.replace_mesh(bpy, live, mesh)
 

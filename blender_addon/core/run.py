@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,8 @@ PIECE = 1 << 18
 """Bytes read at a time: a few milliseconds of work."""
 FAR_BEHIND = 1 << 21
 """From here on the reader skips ahead to the last piece."""
+SILENCE = 900.0
+"""Seconds after which a run that somebody else started and that has no event yet counts as ended."""
 FINAL = ("done", "stopped", "error")
 MOST_MESSAGES = 50
 LONGEST = 500
@@ -137,6 +140,9 @@ class Follower:
         elif run.status == "running" and run.pid and not jobs.process_alive(run.pid, run.began):
             run.status = "killed"
             run.say("The run was killed. Continue it from its last checkpoint with Resume.")
+        elif run.status == "waiting" and time.time() - changed(run.path) > SILENCE:
+            run.status = "error"
+            run.say("It has said nothing for a long time and seems to have ended before its first step. See its log.")
 
     def _more(self) -> bool:
         """Whether the process wrote something between the last read and its end."""
@@ -184,6 +190,14 @@ def inside(run: Path, name: Any) -> str:
         return ""
     path = (run / name).resolve()
     return str(path) if path.is_relative_to(run.resolve()) else ""
+
+
+def changed(run: Path) -> float:
+    """When something was written to the folder, seconds since 1970; now, where that is not known."""
+    try:
+        return run.stat().st_mtime
+    except OSError:
+        return time.time()
 
 
 def length(run: Path) -> int:

@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "llm_prompts"), str(ROOT / "tests" / "blender")]
 
 import bpy  # noqa: E402
+import numpy as np  # noqa: E402
 from made_splats import random_splats  # noqa: E402
 from scripted_server import completion, serving  # noqa: E402
 
@@ -31,7 +32,10 @@ from blender_addon.core.ply import write_ply  # noqa: E402
 
 PATIENCE = 900.0
 """Seconds that a step may take on a slow machine."""
-STEPS = 500
+SAMPLING = 40.0
+"""Seconds for a viewport to gather its samples."""
+STEPS, ENOUGH = 6000, 800
+"""Of the run, and after which it is stopped: it must not end before the slowest window has shown it."""
 WRITTEN = {
     "front": [{"text": "a russet hen with a red comb, seen from the front", "why": "named in the notes"}],
     "back": [{"text": "the tail of a hen, dark green feathers", "why": "No photo shows the back."}],
@@ -57,12 +61,29 @@ def until(true: Callable[[], Any]) -> Story:
         yield 0.1
 
 
-def shoot(out: Path, name: str, seconds: float = 3.0) -> Story:
-    """A picture, after the window had time to draw what has changed."""
-    for share in (0.3, 0.7):
+def shoot(out: Path, name: str) -> Story:
+    """A picture of the window, again and again until something is to be seen in the middle of the viewport: without a
+    graphics card compiling shaders takes minutes."""
+    path = out / f"{name}.png"
+    end = time.monotonic() + PATIENCE
+    while True:
         view()[1].tag_redraw()
-        yield share * seconds
-    subprocess.run(["scrot", "--overwrite", str(out / f"{name}.png")], check=True)
+        yield 2.0
+        subprocess.run(["scrot", "--overwrite", str(path)], check=True)
+        if is_something_in(path):
+            return
+        if time.monotonic() > end:
+            raise TimeoutError(f"nothing is to be seen in {path.name}")
+
+
+def is_something_in(path: Path) -> bool:
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    values = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(values)
+    bpy.data.images.remove(image)
+    middle = values.reshape(height, width, 4)[height // 3 : height * 2 // 3, width // 3 : width // 2, :3]
+    return bool(middle.std(axis=(0, 1)).max() > 0.03)
 
 
 def timed(found: dict[str, Any], operator: Any, **settings: Any) -> None:
@@ -88,6 +109,7 @@ def set_up(out: Path) -> None:
     space.show_region_ui = True
     space.overlay.show_floor = space.overlay.show_axis_x = space.overlay.show_axis_y = space.overlay.show_cursor = False
     bpy.context.scene.eevee.taa_samples = 1  # without a graphics card every sample takes seconds
+    bpy.context.scene.view_settings.view_transform = "Standard"
     settings = bpy.context.scene.gsopt
     settings.folder, settings.threads, settings.prior = str(out / "work"), 1, "off"
     with bpy.context.temp_override(window=window, area=area):
@@ -135,10 +157,10 @@ def source(out: Path, found: dict[str, Any]) -> Story:
     settings.render_views, settings.render_size, settings.render_samples = 18, 128, 4
     timed(found, bpy.ops.gsopt.render_dataset)
     yield from until(lambda: settings.job_dataset.share > 0.2 or settings.job_dataset.state != "RUNNING")
-    yield from shoot(out, "1_source", 1.5)
+    yield from shoot(out, "1_source")
     yield from until(lambda: settings.job_dataset.state != "RUNNING")
     found["dataset"] = [settings.job_dataset.state, settings.job_dataset.message]
-    bpy.data.objects.remove(bpy.context.view_layer.objects.active)
+    view()[2].shading.type = "MATERIAL"
 
 
 def guidance(out: Path, found: dict[str, Any]) -> Story:
@@ -154,6 +176,7 @@ def guidance(out: Path, found: dict[str, Any]) -> Story:
     for _ in range(2):
         bpy.ops.gsopt.proposal(accept=True)
     yield from shoot(out, "2_guidance")
+    bpy.data.objects.remove(bpy.context.view_layer.objects.active)
 
 
 def run(out: Path, data: Path, found: dict[str, Any]) -> Story:
@@ -166,17 +189,17 @@ def run(out: Path, data: Path, found: dict[str, Any]) -> Story:
     yield from until(lambda: watching.live_object(bpy.context.scene) or not settings.run_status)
     live = watching.live_object(bpy.context.scene)
     frame(live)
-    view()[2].shading.type = "MATERIAL"
-    bpy.context.scene.view_settings.view_transform = "Standard"
-    yield from until(lambda: settings.run_step > 0.5 * STEPS or settings.run_status not in watching.OPEN)
     scroll(1)
-    yield from shoot(out, "3_run", 6.0)
+    yield from shoot(out, "3_run")
+    yield from until(lambda: settings.run_step > ENOUGH or settings.run_status not in watching.OPEN)
+    yield from shoot(out, "3_run")
     found["seen running"] = [settings.run_status, settings.run_step, len(live.data.vertices)]
     watching.undo_step("something")
     with bpy.context.temp_override(window=view()[0]):
         bpy.ops.ed.undo()
     settings = bpy.context.scene.gsopt
     found["after an undo"] = settings.run_status
+    timed(found, bpy.ops.gsopt.stop)
     yield from until(lambda: bpy.context.scene.gsopt.run_status not in watching.OPEN)
     settings = bpy.context.scene.gsopt
     found["run"] = [settings.run_status, settings.run_step, settings.run_count]
@@ -202,13 +225,16 @@ def imported(out: Path, data: Path, found: dict[str, Any]) -> Story:
     timed(found, bpy.ops.gsopt.statistics)
     scroll(3)
     bpy.context.scene.eevee.taa_samples = 8
-    yield from shoot(out, "4_inspect", 40.0)
+    yield SAMPLING
+    yield from shoot(out, "4_inspect")
     thing.gsopt.size = 0.25
-    yield from shoot(out, "5_as_a_point_cloud", 30.0)
+    yield SAMPLING
+    yield from shoot(out, "5_as_a_point_cloud")
     thing.gsopt.size = 1.0
     bpy.ops.gsopt.import_cameras(directory=str(data))
     bpy.ops.gsopt.look_through()
-    yield from shoot(out, "6_through_a_camera", 40.0)
+    yield SAMPLING
+    yield from shoot(out, "6_through_a_camera")
 
 
 def a_million(out: Path, found: dict[str, Any]) -> Story:

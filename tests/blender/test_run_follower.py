@@ -128,6 +128,15 @@ def test_a_killed_run_is_noticed_without_its_parent(tmp_path: Path) -> None:
     assert "Resume" in follower.run.problem
 
 
+def test_a_run_that_never_began_is_over_after_a_while(tmp_path: Path) -> None:
+    follower = Follower(tmp_path)
+    assert follower.poll().status == "waiting"
+    os.utime(tmp_path, (0, time.time() - runs.SILENCE - 1))
+    assert follower.poll().status == "error"
+    append(tmp_path, STARTED)
+    assert follower.poll().status == "running", "it was only slow"
+
+
 def test_another_program_with_the_same_process_id_is_not_the_run(tmp_path: Path) -> None:
     if runs.jobs.birth(os.getpid()) is None:
         pytest.skip("this system does not say when a process began")
