@@ -21,8 +21,10 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 import bpy  # noqa: E402
+import numpy as np  # noqa: E402
 
 import blender_addon  # noqa: E402
+from blender_addon import splat_object  # noqa: E402
 
 VIEWS, TEST_VIEWS, SIZE = 6, 2, 48
 SCENE = "scene.blend"
@@ -43,6 +45,21 @@ def bring_mesh(path: Path | None) -> None:
     else:
         bpy.ops.import_scene.gltf(filepath=str(path))
     bpy.ops.object.select_all(action="SELECT")
+    for part in bpy.context.selected_objects:
+        part.location, part.rotation_euler, part.scale = (3, -2, 1), (0.4, 0.2, 1.1), [5 * s for s in part.scale]
+
+
+def box(things: list[Any]) -> Any:
+    """[2, 3] least and greatest corner of what objects' points fill in the world."""
+    worlds = [(np.array(t.matrix_world), splat_object.get(t.data, "position")) for t in things]
+    points = np.concatenate([points @ world[:3, :3].T + world[:3, 3] for world, points in worlds])
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def misplaced(splats: Any) -> float:
+    """How far the box of the splats is from that of the meshes they were learned from, as a share of its size."""
+    meshes = box([o for o in bpy.context.scene.objects if o.type == "MESH" and not splat_object.is_splats(o)])
+    return float(np.abs(box([splats]) - meshes).max() / np.ptp(meshes, axis=0).max())
 
 
 def prepare(work: Path) -> Any:
@@ -96,7 +113,8 @@ def inspect(found: dict[str, Any], work: Path) -> None:
     call(bpy.ops.gsopt.import_splats, from_run=True)
     thing = bpy.context.view_layer.objects.active
     found["imported"] = len(thing.data.vertices)
-    found["place"] = [round(value, 3) for value in thing.matrix_world.translation]
+    bpy.context.view_layer.update()
+    found["misplaced"] = misplaced(thing)
     call(bpy.ops.gsopt.import_cameras)
     call(bpy.ops.gsopt.look_through)
     found["cameras"] = sum(o.type == "CAMERA" for o in bpy.context.scene.objects)

@@ -61,14 +61,14 @@ def until(true: Callable[[], Any]) -> Story:
         yield 0.1
 
 
-def shoot(out: Path, name: str) -> Story:
+def shoot(out: Path, name: str, seconds: float = 2.0) -> Story:
     """A picture of the window, again and again until something is to be seen in the middle of the viewport: without a
     graphics card compiling shaders takes minutes."""
     path = out / f"{name}.png"
     end = time.monotonic() + PATIENCE
     while True:
         view()[1].tag_redraw()
-        yield 2.0
+        yield seconds
         subprocess.run(["scrot", "--overwrite", str(path)], check=True)
         if is_something_in(path):
             return
@@ -154,10 +154,10 @@ def source(out: Path, found: dict[str, Any]) -> Story:
     timed(found, bpy.ops.gsopt.test)
     yield from until(lambda: settings.job_doctor.state != "RUNNING")
     found["doctor"] = settings.doctor
-    settings.render_views, settings.render_size, settings.render_samples = 18, 128, 4
+    settings.render_views, settings.render_size, settings.render_samples = 44, 128, 8
     timed(found, bpy.ops.gsopt.render_dataset)
-    yield from until(lambda: settings.job_dataset.share > 0.2 or settings.job_dataset.state != "RUNNING")
-    yield from shoot(out, "1_source")
+    yield from until(lambda: settings.job_dataset.share > 0.1 or settings.job_dataset.state != "RUNNING")
+    yield from shoot(out, "1_source", 0.5)
     yield from until(lambda: settings.job_dataset.state != "RUNNING")
     found["dataset"] = [settings.job_dataset.state, settings.job_dataset.message]
     view()[2].shading.type = "MATERIAL"

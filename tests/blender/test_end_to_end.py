@@ -53,6 +53,7 @@ def test_from_mesh_to_exported_splats_though_blender_dies(python: str, shared_da
     assert first["seen running"][1] < found["found again"][1] <= found["stopped"][1] < found["resumed"][1]
     assert (found["stopped"][0], found["attached"]) == ("stopped", "stopped")
     assert found["imported"] > found["kept"] > 0
+    assert found["misplaced"] < 0.05, "the splats stand where the mesh stands"
     assert found["cameras"] == 8
     assert found["left behind"] == []
     assert len(read_ply(odd_folder / "edited splats.ply")) == found["kept"]
