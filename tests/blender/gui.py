@@ -65,15 +65,14 @@ def shoot(out: Path, name: str, seconds: float = 2.0) -> Story:
     """A picture of the window, again and again until something is to be seen in the middle of the viewport: without a
     graphics card compiling shaders takes minutes."""
     path = out / f"{name}.png"
-    end = time.monotonic() + PATIENCE
-    while True:
+    end, seen = time.monotonic() + PATIENCE, 0
+    while seen < 2:  # the panel may still be moving in the first one
+        if time.monotonic() > end:
+            raise TimeoutError(f"nothing is to be seen in {path.name}")
         view()[1].tag_redraw()
         yield seconds
         subprocess.run(["scrot", "--overwrite", str(path)], check=True)
-        if is_something_in(path):
-            return
-        if time.monotonic() > end:
-            raise TimeoutError(f"nothing is to be seen in {path.name}")
+        seen += is_something_in(path)
 
 
 def is_something_in(path: Path) -> bool:
@@ -156,6 +155,7 @@ def source(out: Path, found: dict[str, Any]) -> Story:
     found["doctor"] = settings.doctor
     settings.render_views, settings.render_size, settings.render_samples = 44, 128, 8
     timed(found, bpy.ops.gsopt.render_dataset)
+    bpy.context.object.select_set(False)
     yield from until(lambda: settings.job_dataset.share > 0.1 or settings.job_dataset.state != "RUNNING")
     yield from shoot(out, "1_source", 0.5)
     yield from until(lambda: settings.job_dataset.state != "RUNNING")
