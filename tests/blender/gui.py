@@ -34,7 +34,7 @@ PATIENCE = 900.0
 """Seconds that a step may take on a slow machine."""
 SAMPLING = 40.0
 """Seconds for a viewport to gather its samples."""
-STEPS, ENOUGH = 6000, 800
+STEPS, ENOUGH = 10_000, 1000
 """Of the run, and after which it is stopped: it must not end before the slowest window has shown it."""
 WRITTEN = {
     "front": [{"text": "a russet hen with a red comb, seen from the front", "why": "named in the notes"}],
