@@ -201,6 +201,8 @@ class SparseConfig:
     """Replaces the weight of LossConfig where this is larger."""
     sh_degree: int = 2
     """Upper bound on the bands."""
+    steps_per_view: int = 500
+    """A run takes at most this many steps per input view: more learn few views by heart; 0 = no bound."""
 
     def __post_init__(self) -> None:
         check.at_least("--sparse.below-views", self.below_views, 0, "0 turns these regularisers off.")
@@ -210,6 +212,7 @@ class SparseConfig:
         check.within("--sparse.lambda-scale", self.lambda_scale, 0.0, MOST, "The default is 0.01.")
         check.within("--sparse.lambda-alpha", self.lambda_alpha, 0.0, MOST, "The default is 0.5.")
         check.within("--sparse.sh-degree", self.sh_degree, 0, 3, "Bands 0 to 3 are supported.")
+        check.at_least("--sparse.steps-per-view", self.steps_per_view, 0, "0 sets no bound; the default is 500.")
 
 
 @dataclass(frozen=True)

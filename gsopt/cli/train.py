@@ -78,8 +78,8 @@ class Flags:
     """Continue the run in that folder from its newest checkpoint, with the same result as if it had never stopped."""
     preset: Preset = "default"
     """draft: 2000 steps with more skips; default: 7000 steps; high: 15,000 steps. Other flags win over it."""
-    iterations: int = 7000
-    """Training steps."""
+    iterations: Annotated[int | None, arg(metavar="N")] = None
+    """Training steps. When not given: as many as the preset has, and with few views no more than 500 per input view."""
     views: Annotated[int | None, arg(metavar="N")] = None
     """Learn from this many input views, well spread by camera position; all when not given."""
     view_ids: Annotated[str | None, arg(metavar="I,J,...")] = None
@@ -121,7 +121,7 @@ class Flags:
 
 def main(argv: Sequence[str]) -> int:
     """Run `gsopt train` with these arguments: 0 when done or stopped, else a GsoptError or KeyboardInterrupt."""
-    start = with_preset(Flags(), chosen(argv))
+    start = replace(with_preset(Flags(), chosen(argv)), iterations=None)
     flags = tyro.cli(Flags, default=start, prog="gsopt train", args=list(argv))
     config, run = read_flags(flags)
     config = with_poses(config, run)
@@ -214,6 +214,11 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
     """All settings of a new run. The dataset's path is made absolute, so that the run can be resumed from anywhere."""
     if flags.white_background and flags.background not in (None, "white"):
         raise UsageError(f"`-w` and `--background {flags.background}` contradict each other. Keep one of them.")
+    iterations, sparse = flags.iterations, flags.sparse
+    if iterations is None:
+        iterations = with_preset(settings.TrainConfig(), flags.preset).iterations
+    else:  # a number that is given is meant, however few the views
+        sparse = replace(sparse, steps_per_view=0)
     return settings.TrainConfig(
         data=settings.DataConfig(
             path=str(data.expanduser().absolute()),
@@ -228,12 +233,12 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
         optimizer=flags.optimizer,
         loss=flags.loss,
         density=settings.DensityConfig(**dataclasses.asdict(flags.density)),
-        sparse=flags.sparse,
+        sparse=sparse,
         schedule=flags.schedule,
         guidance=guidance_config(flags.guidance),
         poses=settings.PoseConfig(**dataclasses.asdict(flags.poses)),
         preset=flags.preset,
-        iterations=flags.iterations,
+        iterations=iterations,
         seed=flags.seed,
         backend=flags.backend,
         threads=flags.threads,

@@ -74,6 +74,7 @@ class Report:
     input_count: int | None = None
     test_count: int | None = None
     n_gaussians: int | None = None
+    steps: int | None = None
     backend: str | None = None
     turntable: list[Image.Image] = field(default_factory=list)
     guidance: str = ""
@@ -181,6 +182,8 @@ def _take_figures(report: Report) -> None:
     ]
     count = number(report.metrics.get("n_gaussians"))
     report.n_gaussians = None if count is None else int(count)
+    steps = number(report.metrics.get("steps"))
+    report.steps = None if steps is None else int(steps)
 
 
 def _take_inputs(report: Report, scene: Scene) -> None:

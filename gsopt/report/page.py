@@ -40,7 +40,7 @@ def page(report: Report) -> str:
 def header(report: Report) -> str:
     """Name, turntable and the key figures."""
     facts = [_count(report.input_count, "input view"), _count(report.test_count, "held-out view")]
-    facts += [f"{report.config.iterations:,} steps", report.config.density.strategy]
+    facts += ["" if report.steps is None else f"{report.steps:,} steps", report.config.density.strategy]
     line = " · ".join(escape(fact) for fact in facts if fact)
     return (
         '<header><p class="eyebrow">gsopt report</p>'

@@ -75,6 +75,7 @@ def train(
         with one_torch_thread():
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
+            config = schedule.shortened(config, len(scene.train))
             guidance = start_guidance(config, scene, backend, directory)
             trainer, clock = _start(config, scene, backend, directory, guidance, began)
             stopped = _advance(trainer, directory, stop, clock)

@@ -6,7 +6,7 @@ Steps count from 1 to `iterations`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gsopt.config import MOST_GAUSSIANS, DensityConfig, OptimizerConfig, TrainConfig
 
@@ -38,6 +38,13 @@ class Weights:
 def is_sparse(config: TrainConfig, views: int) -> bool:
     """Whether the regularisers for few views are on."""
     return views <= config.sparse.below_views
+
+
+def shortened(config: TrainConfig, views: int) -> TrainConfig:
+    """The configuration with no more steps than few views can use."""
+    if config.sparse.steps_per_view == 0 or not is_sparse(config, views):
+        return config
+    return replace(config, iterations=min(config.iterations, config.sparse.steps_per_view * views))
 
 
 def weights(config: TrainConfig, views: int) -> Weights:

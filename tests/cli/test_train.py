@@ -80,7 +80,6 @@ def test_no_flag_is_the_default_configuration() -> None:
         ("--cache-mb 9", "data.cache_mb", 9),
         ("--init hull", "init.method", "hull"),
         ("--init-count 9", "init.count", 9),
-        ("--iterations 9", "iterations", 9),
         ("--seed 9", "seed", 9),
         ("--threads 9", "threads", 9),
         ("--antialiased", "antialiased", True),
@@ -107,6 +106,12 @@ def test_every_flag_sets_its_setting_and_no_other(flags: str, key: str, value: o
         group = group[part]
     group[name] = value
     assert config_of(flags).to_dict() == expected
+
+
+def test_steps_that_are_given_are_meant_and_those_of_a_preset_are_what_few_views_may_shorten() -> None:
+    for flags, steps, bound in (("", 7000, 500), ("--preset high", 15_000, 500), ("--iterations 7000", 7000, 0)):
+        config = config_of(flags)
+        assert (config.iterations, config.sparse.steps_per_view) == (steps, bound)
 
 
 def test_inria_spells_source_and_model_path() -> None:

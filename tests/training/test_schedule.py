@@ -116,6 +116,21 @@ def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
     assert schedule.lr_share(1000, 1000, few, config.optimizer) == 1.0
 
 
+def test_few_views_shorten_a_run_and_many_never_do() -> None:
+    config = TrainConfig()
+    per_view, few = config.sparse.steps_per_view, config.sparse.below_views
+    assert [schedule.shortened(config, views).iterations for views in (1, 4, 8)] == [
+        per_view,
+        4 * per_view,
+        8 * per_view,
+    ]
+    assert schedule.shortened(config, few) == schedule.shortened(config, few + 1) == config
+    unbound = TrainConfig(sparse=SparseConfig(steps_per_view=0))
+    assert schedule.shortened(unbound, 1) == unbound
+    short = TrainConfig(iterations=50)
+    assert schedule.shortened(short, 4) == short
+
+
 def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
     short, long = TrainConfig(iterations=7000), TrainConfig(iterations=28_000)
     assert schedule.max_gaussians(short, 50_000) == 72_000
