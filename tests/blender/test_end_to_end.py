@@ -69,7 +69,7 @@ def test_the_script_of_the_documentation_runs(python: str, tmp_path: Path) -> No
         "scene.threads = 1\n"
     )
     end = "\nprint('found {\"splats\": %d}' % len(bpy.context.view_layer.objects.active.data.vertices))\n"
-    (tmp_path / "script.py").write_text(begin + script.replace("= 2000", "= 60") + end, encoding="utf-8")
+    (tmp_path / "script.py").write_text(begin + script.replace("2000", "60") + end, encoding="utf-8")
     assert found_by(python, str(tmp_path / "script.py"), tmp_path)["splats"] > 0
     assert list((tmp_path / "work" / "runs").glob("*/splat.ply"))
 
