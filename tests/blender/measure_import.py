@@ -1,6 +1,6 @@
-"""Seconds of CPU and megabytes that importing takes, a line of JSON per count. For people, not for the test suite.
+"""Seconds of CPU and megabytes that importing takes, added to a list in a file. For people, not for the test suite.
 
-python tests/blender/measure_import.py FOLDER 10000 100000 1000000      (a Python with the module bpy)
+python tests/blender/measure_import.py benchmarks/results/blender.json 10000 100000 1000000      (needs bpy)
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -67,15 +68,18 @@ def measure(path: Path, count: int) -> dict[str, Any]:
     return found
 
 
-def main(folder: Path, counts: list[int]) -> None:
+def main(results: Path, counts: list[int]) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     splat_object.splat_material(bpy)
     nodes.node_group(bpy)
+    found = json.loads(results.read_text()) if results.exists() else []
     for count in counts:
-        path = folder / f"{count}.ply"
-        write_ply(path, random_splats(count))
-        gc.collect()
-        print(json.dumps(measure(path, count)), flush=True)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{count}.ply"
+            write_ply(path, random_splats(count))
+            gc.collect()
+            found.append(measure(path, count))
+    results.write_text("[\n" + ",\n".join(json.dumps(entry) for entry in found) + "\n]\n")
 
 
 if __name__ == "__main__":
