@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Sequence
 from html import escape
 from importlib import resources
@@ -23,7 +24,7 @@ from gsopt.events import write_atomic
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 STYLE = (
     ".grid{border-spacing:6px;border-collapse:separate}.grid td{padding:0;vertical-align:top;text-align:center}"
-    ".grid img{display:block;width:150px;height:auto}.grid td.none{color:#888}svg{max-width:560px;height:auto}"
+    ".grid img{display:block;width:150px;height:auto}.grid td.none{color:#888}svg{max-width:540px;height:auto}"
     ".charts{display:flex;flex-wrap:wrap;gap:1rem}"
 )
 PREFIX = "data:image/webp;base64,"
@@ -38,9 +39,9 @@ def write_html(document: dict[str, Any], pictures: dict[str, Any], path: Path) -
 def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
     suite = declared.load(document["suite"])
     style = (resources.files("gsopt.report") / "style.css").read_text(encoding="utf-8")
-    lines = "".join(f"<p>{escape(line)}</p>" for line in about(document))
+    lines = "".join(f"<p>{marked(line)}</p>" for line in about(document))
     sections = "".join(section(made, pictures) for made in parts(document))
-    rest = "".join(f"<li>{escape(line)}</li>" for line in missing(document))
+    rest = "".join(f"<li>{marked(line)}</li>" for line in missing(document))
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
@@ -53,9 +54,14 @@ def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
     )
 
 
+def marked(text: str) -> str:
+    """Escaped, with what stands between backticks as code."""
+    return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
+
+
 def section(made: Part, pictures: dict[str, Any]) -> str:
     """A group: tables, charts, pictures."""
-    out = [f"<section><h2>{escape(made.title)}</h2><p>{escape(' '.join(made.lines))}</p>"]
+    out = [f"<section><h2>{escape(made.title)}</h2><p>{marked(' '.join(made.lines))}</p>"]
     for note, (head, rows) in made.tables:
         cells = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
         body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)

@@ -27,6 +27,7 @@ METRICS = {
 }
 COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 BETTER_BELOW = ("lpips_alex", "lpips_vgg", "depth_error")
+SEEDS = 3
 Table = tuple[list[str], list[list[str]]]
 
 
@@ -65,19 +66,20 @@ def part(suite: Suite, group: Group, views: str, runs: list[Run]) -> Part:
     made = Part(title, [group.why], views=views, ways=ways)
     made.scenes = [scene for scene in group.scenes if any(run["scene"] == scene for run in runs)]
     seeds = sorted({run["seed"] for run in runs})
-    made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, seeds {', '.join(map(str, seeds))}.")
+    which = ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
+    made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, {which}.")
     same = suite_stats.common(runs, ways)
     note = "Means over scenes, seeds averaged first; " + ("what every arm has." if same else "arms differ in scenes.")
     made.tables.append((note, figures(same or runs, ways)))
     pairs = list(comparisons(group, ways))
     if rows := [row for a, b in pairs if (row := compared(runs, a, b))]:
         what = "scenes" if len(made.scenes) > 1 else "seeds of the one scene"
-        head = ["paired difference", what, *(f"Δ {METRICS[m][0]}" for m in COMPARED), "PSNR worst", "better in"]
+        head = ["paired difference", what, *(f"Δ {METRICS[m][0]}" for m in COMPARED), "PSNR worst", "PSNR better in"]
         made.tables.append(("Mean with its 95 % confidence interval (Student's t); losses included.", (head, rows)))
-    if rows := [row for a, _ in pairs if (row := time_row(runs, a, ways[0]))]:
+    if len(ways) > 1 and (rows := [row for a in ways if (row := time_row(runs, a, ways[0]))]):
         note = f"CPU seconds until a run is as good as {_name(ways[0])} ends on the same scene (PSNR of "
         note += f"{max(run['curve_views'] for run in runs)} held-out views, looked at {declared.LOOKS} times)."
-        made.tables.append((note, (["", "median of those that get there", "get there", "whole run"], _unique(rows))))
+        made.tables.append((note, (["arm", "median of those that get there", "get there", "whole run, median"], rows)))
     if len(made.scenes) > 1:
         made.tables.append(("PSNR of every scene.", scene_rows(runs, made.scenes, ways)))
     made.charts = charts(f"suite-{suite.name}-{group.name}" + (f"-{view_count(views)}" if several else ""), made, runs)
@@ -197,10 +199,12 @@ def missing(document: dict[str, Any]) -> list[str]:
     have = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["runs"]}
     skipped = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["skipped"]}
     lines, lacking = [], Counter[str]()
-    for case in declared.cases(suite, 3):
+    for case in declared.cases(suite, SEEDS):
         known = (case.group, case.scene, case.views, case.arm, case.iterations, case.seed)
         if known not in have and known not in skipped:
-            lacking[f"{case.group}, {view_count(case.views)} views, seed {case.seed}"] += 1
+            begun = any(run["seed"] == case.seed for run in document["runs"])
+            where = f"{case.group}, {view_count(case.views)} views, " if begun else ""
+            lacking[f"{where}seed {case.seed}"] += 1
     if lacking:
         lines.append("Not run yet: " + "; ".join(f"{what} ({count} runs)" for what, count in lacking.items()) + ".")
     reasons: dict[str, Counter[str]] = {}
@@ -238,7 +242,3 @@ def _name(one: Way) -> str:
 
 def _count(count: int, thing: str) -> str:
     return f"{count} {thing}{'' if count == 1 else 's'}"
-
-
-def _unique(rows: list[list[str]]) -> list[list[str]]:
-    return list({tuple(row): row for row in rows}.values())
