@@ -107,7 +107,7 @@ def set_up(out: Path) -> None:
         bpy.data.objects.remove(other)
     space.show_region_ui = True
     space.overlay.show_floor = space.overlay.show_axis_x = space.overlay.show_axis_y = space.overlay.show_cursor = False
-    bpy.context.scene.eevee.taa_samples = 1  # without a graphics card every sample takes seconds
+    bpy.context.scene.eevee.taa_samples = 4  # without a graphics card every sample takes seconds
     bpy.context.scene.view_settings.view_transform = "Standard"
     settings = bpy.context.scene.gsopt
     settings.folder, settings.threads, settings.prior = str(out / "work"), 1, "off"
