@@ -62,7 +62,7 @@ def summary(splats: Splats) -> Summary:
     """Counts, extent and histograms; zeros where there are no splats."""
     if not len(splats):
         return Summary(0, splats.sh_degree, (0, 0, 0), (0, 0, 0), 0.0, (), (), 0)
-    size = np.maximum(sizes(splats), 1e-30)
+    size = np.maximum(sizes(splats), 1e-30).astype(np.float64)  # rounded to float32, an end could fall off its bin
     low, high = np.quantile(np.log10(size), (0.001, 0.999))
     edges = 10 ** np.linspace(low, max(high, low + 0.01), BINS + 1)
     return Summary(
