@@ -184,6 +184,7 @@ def run(out: Path, data: Path, found: dict[str, Any]) -> Story:
     settings = bpy.context.scene.gsopt
     settings.source, settings.dataset = "DATASET", str(data)
     settings.preset, settings.iterations = "own", STEPS
+    watching.undo_step("before the run")
     watching.TIMES.clear()
     timed(found, bpy.ops.gsopt.launch)
     yield from until(lambda: watching.live_object(bpy.context.scene) or not settings.run_status)

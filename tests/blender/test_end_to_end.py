@@ -24,10 +24,14 @@ BLENDERS = [path for path in os.environ.get("GSOPT_BLENDERS", "").split(os.paths
 pytestmark = pytest.mark.skipif(not BLENDERS, reason="takes minutes: `make test-blender` runs it")
 
 
+LEAVE = "import os, runpy, sys; runpy.run_path(sys.argv[1], run_name='__main__'); sys.stdout.flush(); os._exit(0)"
+"""Runs a script and leaves without Python's farewell, in which bpy 4.5 sometimes waits forever for a thread of its own."""
+
+
 def found_by(python: str, script: str, work: Path, *words: str) -> dict[str, Any]:
     """What a script of this folder found in a Blender of its own."""
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(work)}
-    command = [python, str(HERE / script), "--", *words]
+    command = [python, "-c", LEAVE, str(HERE / script), "--", *words]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, encoding="utf-8")
     lines = [line for line in done.stdout.splitlines() if line.startswith("found ")]
     assert lines, done.stdout[-3000:] + done.stderr[-3000:]
