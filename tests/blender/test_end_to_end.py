@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(not BLENDERS, reason="takes minutes: `make test-
 
 
 LEAVE = "import os, runpy, sys; runpy.run_path(sys.argv[1], run_name='__main__'); sys.stdout.flush(); os._exit(0)"
-"""Runs a script and leaves without Python's farewell, in which bpy 4.5 sometimes waits forever for a thread of its own."""
+"""Runs a script and leaves without Python's farewell: bpy 4.5 sometimes waits there forever for a thread of its own."""
 
 
 def found_by(python: str, script: str, work: Path, *words: str) -> dict[str, Any]:
