@@ -34,7 +34,7 @@ def curve(finished: FinishedRun, scene: Scene, events: Sequence[Event], setup: f
     """Held-out quality at every preview and at the end (`suite_file.LOOK`), over CPU seconds."""
     count = min(CURVE_VIEWS, len(scene.test))
     views = [scene.test[i * len(scene.test) // count] for i in range(count)]
-    steps = finished.config.iterations
+    steps = int(events[-1]["step"])
     previews = [event for event in events if event["kind"] == "preview" and event["step"] < steps]
     moments = [(event["step"], finished.path / event["path"]) for event in previews]
     moments.append((steps, finished.path / "splat.ply"))
