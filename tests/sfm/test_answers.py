@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.data.sfm import diagnosis
-from gsopt.data.sfm.features import ViewGraph, choose_matching, neighbors_in_time
-from gsopt.data.sfm.mapping import mappers_to_try, seed_photos
+from gsopt.data.sfm.features import ViewGraph, choose_matching, neighbors_in_time, reader_options
+from gsopt.data.sfm.mapping import mappers_to_try, off_center, seed_photos
 from gsopt.data.sfm.photos import Photo, Refused
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
@@ -137,6 +137,19 @@ def test_what_auto_becomes() -> None:
     assert mappers_to_try(auto, 300) == ["incremental", "hybrid"]
     assert mappers_to_try(auto, 301) == ["hybrid", "incremental"]
     assert mappers_to_try(replace(auto, mapper="global"), 10) == ["global"]
+
+
+@pytest.mark.parametrize("count", [3, 19, 20, 200])
+def test_a_lens_that_is_not_named_has_one_focal_length_and_a_center_near_the_middle(count: int) -> None:
+    """Photos from around an object fix neither a second focal length nor a center far off."""
+    pycolmap = pytest.importorskip("pycolmap")
+    photos = [replace(photo(f"{i}.jpg"), focal=3000.0) for i in range(count)]
+    model = reader_options(pycolmap, photos, SfmConfig()).camera_model
+    lens = pycolmap.Camera.create_from_model_name(0, model, 3000.0, 4000, 3000)
+    assert len(lens.focal_length_idxs()) == 1
+    assert off_center(lens) == 0
+    lens.principal_point_y = 1500 + 0.2 * 3000
+    assert off_center(lens) == pytest.approx(0.2)
 
 
 def test_the_seed_is_the_best_connected_photos_and_leaves_pairs_without_depth_out() -> None:

@@ -17,8 +17,9 @@ from gsopt.data.sfm.settings import SfmConfig
 Say = Callable[[str], None]
 Pair = tuple[str, str]
 
-ENOUGH_FOR_OPENCV = 20
-"""Photos with one camera from which on four lens terms are found reliably."""
+ENOUGH_FOR_RADIAL = 20
+"""Photos with one camera from which on two lens terms are found reliably. Both axes always have one focal length: cameras
+that go round an object at one height leave the vertical one open (a rendered orbit: 7 times the true one)."""
 EXHAUSTIVE_UP_TO = 200
 NEIGHBORS_IN_TIME = 10
 LOOPS, LOOK_ALIKES = 5, 30
@@ -93,7 +94,7 @@ def reader_options(pycolmap: ModuleType, shared: Sequence[Photo], config: SfmCon
     """Lens model and first guess for photos of one camera."""
     model = config.camera_model
     if model == "auto":
-        model = "OPENCV" if len(shared) >= ENOUGH_FOR_OPENCV else "SIMPLE_RADIAL"
+        model = "RADIAL" if len(shared) >= ENOUGH_FOR_RADIAL else "SIMPLE_RADIAL"
     options = pycolmap.ImageReaderOptions()
     options.camera_model = model
     focal = config.focal or shared[0].focal

@@ -5,6 +5,7 @@ Everything here runs on one thread: sums over several threads would give other b
 
 from __future__ import annotations
 
+import copy
 import itertools
 import shutil
 from collections import Counter
@@ -28,7 +29,10 @@ SEED_PHOTOS = 16
 TRIANGULATIONS = 2
 """How often the points of a global model are made anew from all matches; each time the poses are adjusted to them."""
 ENOUGH_FOR_CENTER = 10
-"""Photos of one camera from which on the last adjustment may move its principal point."""
+"""Photos of one camera from which on an adjustment may move its principal point."""
+MOST_OFF_CENTER = 0.03
+"""How far from the middle it may then lie, as a share of the photo's width or height. Where a camera went round an
+object at one height, a shift of all photos looks like a turn of all cameras: 13 % and 5 degrees on a rendered orbit."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ def find_poses(
         return None
     if best.mapper != "incremental":
         best = replace(best, reconstruction=_settled(pycolmap, best.reconstruction, database, photos, config))
-    adjust(pycolmap, best.reconstruction, config)
+    best = replace(best, reconstruction=adjusted(pycolmap, best.reconstruction, config))
     keep_coherent(best.reconstruction)
     return best if len(best.names) >= SMALLEST_MODEL else None
 
@@ -107,12 +111,27 @@ def run_mapper(
     return sorted(placed, key=lambda model: (-model.num_reg_images(), min(registered(model))))
 
 
-def adjust(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> None:
-    """A last bundle adjustment over everything; where many photos share a camera, its principal point may move."""
+def adjusted(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> Any:
+    """After bundle adjustment over everything; where many photos share a camera, its principal point may move."""
+    if reconstruction.num_reg_images() >= ENOUGH_FOR_CENTER * len(reconstruction.cameras):
+        moved = _bundle_adjusted(pycolmap, reconstruction, config, center=True)
+        if all(off_center(camera) <= MOST_OFF_CENTER for camera in moved.cameras.values()):
+            return moved
+    return _bundle_adjusted(pycolmap, reconstruction, config, center=False)
+
+
+def off_center(camera: Any) -> float:
+    """How far the principal point lies from the middle of the photo, as a share of its width or height."""
+    x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
+    return float(max(abs(x - 0.5), abs(y - 0.5)))
+
+
+def _bundle_adjusted(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig, *, center: bool) -> Any:
+    reconstruction = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = config.focal is None
-    options.refine_principal_point = reconstruction.num_reg_images() >= ENOUGH_FOR_CENTER * len(reconstruction.cameras)
+    options.refine_principal_point = center
     options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
     options.ceres.solver_options.num_threads = 1
     everything = pycolmap.BundleAdjustmentConfig()
@@ -122,6 +141,7 @@ def adjust(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> None
     pycolmap.create_default_bundle_adjuster(options, everything, reconstruction).solve()
     pycolmap.ObservationManager(reconstruction).filter_all_points3D(4.0, 1.5)
     reconstruction.update_point_3d_errors()
+    return reconstruction
 
 
 def keep_coherent(reconstruction: Any) -> None:
@@ -258,7 +278,7 @@ def _settled(pycolmap: ModuleType, model: Any, database: Path, photos: Path, con
     """
     options = incremental_options(pycolmap, config)
     for i in range(TRIANGULATIONS):
-        adjust(pycolmap, model, config)
+        model = adjusted(pycolmap, model, config)
         folder = database.with_name(f"points{i}")
         folder.mkdir()
         model = pycolmap.triangulate_points(

@@ -32,7 +32,7 @@ class SfmConfig:
     masks: str = "auto"
     """A folder of masks (white shows), alpha (of the photos), none, or auto: the folder masks/, else alpha."""
     camera_model: CameraModel = "auto"
-    """Lens model; auto takes OPENCV where at least 20 photos share a camera, else SIMPLE_RADIAL."""
+    """Lens model; auto takes RADIAL where at least 20 photos share a camera, else SIMPLE_RADIAL."""
     focal: float | None = None
     """Focal length in pixels of the full-size photos, if known: it is kept. Read from EXIF when not given."""
     max_size: int = 1600
