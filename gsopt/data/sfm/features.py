@@ -18,8 +18,8 @@ Say = Callable[[str], None]
 Pair = tuple[str, str]
 
 ENOUGH_FOR_RADIAL = 20
-"""Photos with one camera from which on two lens terms are found reliably. Both axes always have one focal length: cameras
-that go round an object at one height leave the vertical one open (a rendered orbit: 7 times the true one)."""
+"""Photos with one camera from which on two lens terms are found reliably. Both axes always have one focal length:
+cameras that go round an object at one height leave the vertical one open (a rendered orbit: 7 times the true one)."""
 EXHAUSTIVE_UP_TO = 200
 NEIGHBORS_IN_TIME = 10
 LOOPS, LOOK_ALIKES = 5, 30
