@@ -20,8 +20,8 @@ from .core.spz import read_spz
 
 SLICE = 0.005
 """Seconds of the main thread after which a tick begins nothing more."""
-Finish = Callable[[Any, Any, statistics.Summary], None]
-"""Gets the scene, the mesh and what can be said about it."""
+Finish = Callable[[Any, Any, statistics.Summary], Iterator[None]]
+"""Gets the scene, the mesh and what can be said about it; goes on with a later tick after every yield."""
 SUMMARIES: dict[str, statistics.Summary] = {}
 """By name of the mesh; made anew when asked for."""
 
@@ -78,13 +78,15 @@ class Loading:
         if self.error or self._read is None:
             return True
         if self._steps is None:
-            self._steps = splat_object.mesh_in_steps(bpy, self.path.stem, self._read[0])
+            self._steps = self._hand_over(scene, *self._read)
         until = time.perf_counter() + SLICE
-        for mesh in self._steps:
+        return not any(pause or time.perf_counter() > until for pause in self._steps)
+
+    def _hand_over(self, scene: Any, parts: list[splat_object.Part], summary: statistics.Summary) -> Iterator[bool]:
+        """The mesh bit by bit, then what is made of it; True where the rest is for another tick."""
+        for mesh in splat_object.mesh_in_steps(bpy, self.path.stem, parts):
+            yield False
             if mesh is not None:
-                SUMMARIES[mesh.name] = self._read[1]
-                self.finish(scene, mesh, self._read[1])
-                return True
-            if time.perf_counter() > until:
-                break
-        return False
+                SUMMARIES[mesh.name] = summary
+                for _ in self.finish(scene, mesh, summary):
+                    yield True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -83,14 +84,16 @@ class GSOPT_OT_import_splats(Waiting, bpy.types.Operator):
         path = loading.splat_file(source)
         matrix = frame(settings, data_of(source if source.is_dir() else path.parent))
 
-        def finish(target: Any, mesh: Any, summary: statistics.Summary) -> None:
+        def finish(target: Any, mesh: Any, summary: statistics.Summary) -> Iterator[None]:
             thing = watching.add_object(target, mesh, summary, str(source), target.gsopt.display)
             thing.matrix_world = matrix
             live = watching.live_object(target) if replaces_live else None
             if live is not None:
                 splat_object.remove(bpy, live)
             let_cycles_see_through(target)
+            yield  # Blender evaluates the nodes
             activate(thing)
+            yield
             watching.undo_step("Import Splats")
 
         watching.load(scene, path, finish)

@@ -268,8 +268,9 @@ def look_at_run(scene: Any) -> None:
         _loads[scene.session_uid, "live"] = loading.Loading(Path(run.preview), settings.live_most, show_live)
 
 
-def show_live(scene: Any, mesh: Any, summary: Summary) -> None:
+def show_live(scene: Any, mesh: Any, summary: Summary) -> Iterator[None]:
     """Bring the newest splats into the viewport."""
+    yield
     live = live_object(scene)
     if live is None:
         live = add_object(scene, mesh, summary, scene.gsopt.run_path, "Ellipsoids")
