@@ -98,7 +98,8 @@ def test_gsopt_takes_the_flags(
     assert words[:4] == ["python", "-m", "gsopt", "train"]
     flags = tyro.cli(Flags, args=words[4:])
     assert flags.preset == (training.preset or "default")
-    assert (flags.iterations, flags.resolution, flags.seed) == (training.iterations, training.downscale, training.seed)
+    steps = None if training.preset else training.iterations
+    assert (flags.iterations, flags.resolution, flags.seed) == (steps, training.downscale, training.seed)
     assert (flags.views or 0, flags.density.max_gaussians or 0) == (training.views, training.max_gaussians)
     assert (flags.density.strategy, flags.background) == (training.strategy, training.background)
     assert (flags.threads, flags.backend, flags.eval) == (training.threads, training.backend, training.hold_out)
