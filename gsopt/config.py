@@ -278,6 +278,7 @@ class TrainConfig:
     preset: Preset = "default"
     """Where the settings came from that no flag named (gsopt/presets.py)."""
     iterations: int = 7000
+    """Steps; with few views no more than `sparse.steps_per_view` for each."""
     seed: int = 0
     backend: Literal["auto", "cpu", "reference"] = "auto"
     threads: int = 0
@@ -297,6 +298,11 @@ class TrainConfig:
         check.one_of("--backend", self.backend, ("auto", "cpu", "reference"))
         check.at_least("--checkpoint-every", self.checkpoint_every, 0, "0 writes only the last one.")
         check.at_least("--preview-every", self.preview_every, 0, "0 writes none.")
+
+    def with_steps(self, steps: int) -> TrainConfig:
+        """The same with exactly so many steps, however few the views."""
+        sparse = dataclasses.replace(self.sparse, steps_per_view=0)
+        return dataclasses.replace(self, iterations=steps, sparse=sparse)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; `from_dict` is its inverse."""

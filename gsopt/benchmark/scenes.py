@@ -53,10 +53,11 @@ class Task:
         config = with_preset(
             TrainConfig(data=self.data, guidance=GuidanceConfig(lambda_sds=0.0), threads=1), self.preset
         )
-        iterations = self.iterations or config.iterations
-        looks = max(1, iterations // LOOKS) if self.kind == "curve" else 0
+        if self.iterations is not None:
+            config = config.with_steps(self.iterations)
+        looks = max(1, config.iterations // LOOKS) if self.kind == "curve" else 0
         density = DensityConfig(max_gaussians=self.max_gaussians)
-        return replace(config, iterations=iterations, density=density, preview_every=looks, checkpoint_every=0)
+        return replace(config, density=density, preview_every=looks, checkpoint_every=0)
 
     def key(self) -> tuple[Any, ...]:
         """What makes two records records of the same run."""

@@ -214,12 +214,7 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
     """All settings of a new run. The dataset's path is made absolute, so that the run can be resumed from anywhere."""
     if flags.white_background and flags.background not in (None, "white"):
         raise UsageError(f"`-w` and `--background {flags.background}` contradict each other. Keep one of them.")
-    iterations, sparse = flags.iterations, flags.sparse
-    if iterations is None:
-        iterations = with_preset(settings.TrainConfig(), flags.preset).iterations
-    else:  # a number that is given is meant, however few the views
-        sparse = replace(sparse, steps_per_view=0)
-    return settings.TrainConfig(
+    config = settings.TrainConfig(
         data=settings.DataConfig(
             path=str(data.expanduser().absolute()),
             views=flags.views,
@@ -233,12 +228,12 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
         optimizer=flags.optimizer,
         loss=flags.loss,
         density=settings.DensityConfig(**dataclasses.asdict(flags.density)),
-        sparse=sparse,
+        sparse=flags.sparse,
         schedule=flags.schedule,
         guidance=guidance_config(flags.guidance),
         poses=settings.PoseConfig(**dataclasses.asdict(flags.poses)),
         preset=flags.preset,
-        iterations=iterations,
+        iterations=with_preset(settings.TrainConfig(), flags.preset).iterations,
         seed=flags.seed,
         backend=flags.backend,
         threads=flags.threads,
@@ -246,6 +241,7 @@ def make_config(flags: Flags, data: Path) -> settings.TrainConfig:
         checkpoint_every=flags.checkpoint_every,
         preview_every=flags.preview_every,
     )
+    return config if flags.iterations is None else config.with_steps(flags.iterations)
 
 
 def guidance_config(flags: Guidance) -> GuidanceConfig:

@@ -14,6 +14,7 @@ from gsopt.benchmark.scenes import Task, front, time_at
 from gsopt.config import DataConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.presets import PRESETS
+from gsopt.training.schedule import shortened
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +88,8 @@ def test_a_task_with_a_length_or_a_budget_belongs_to_the_grid() -> None:
     assert Task("a", data, "high").kind == "curve"
     assert Task("a", data, iterations=5).kind == Task("a", data, max_gaussians=5).kind == "grid"
     assert Task("a", data, "high").config().iterations == PRESETS["high"]["iterations"]
+    one_view = shortened(Task("a", data, iterations=6000).config(), 1)
+    assert one_view.iterations == 6000  # a point of the grid is as long as its record says
 
 
 def test_times_lie_between_what_was_told() -> None:

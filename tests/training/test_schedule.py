@@ -125,8 +125,9 @@ def test_few_views_shorten_a_run_and_many_never_do() -> None:
         8 * per_view,
     ]
     assert schedule.shortened(config, few) == schedule.shortened(config, few + 1) == config
-    unbound = TrainConfig(sparse=SparseConfig(steps_per_view=0))
-    assert schedule.shortened(unbound, 1) == unbound
+    meant = config.with_steps(7000)
+    assert schedule.shortened(meant, 1) == meant
+    assert meant.iterations == 7000
     short = TrainConfig(iterations=50)
     assert schedule.shortened(short, 4) == short
 
