@@ -21,10 +21,13 @@ class Course:
     """Decay of the averaged weights, which are the ones that are kept; lower at first."""
     save_every: int = 200
     seed: int = 0
+    clip_steps: int = 1000
+    """Steps of the CLIP that learns the scenes' captions, where they have captions and --base has no CLIP."""
 
     def __post_init__(self) -> None:
         check.at_least("--steps", self.steps, 1, "A few thousand are a start.")
         check.at_least("--batch", self.batch, 1, "16 is usual.")
+        check.at_least("--clip-steps", self.clip_steps, 0, "0 trains none: the prior takes no words.")
         check.within("--lr", self.lr, 0.0, 1.0, "The default is 4e-4.")
 
     def rate(self, step: int) -> float:

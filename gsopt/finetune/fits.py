@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -67,6 +67,10 @@ class Pairs:
             return Pairs(**load_file(path))
         except (OSError, SafetensorError, TypeError) as error:
             raise InputError(f"Cannot read the pairs {path} ({error}). Delete the file; it is made again.") from error
+
+    def rows(self, rows: Int[Tensor, "m"]) -> Pairs:
+        """Some of them."""
+        return Pairs(*(tensor[rows] for tensor in vars(self).values()))
 
     @staticmethod
     def cat(parts: list[Pairs]) -> Pairs:

@@ -69,7 +69,7 @@ def model_card(
         "",
         "A U-Net (`UNet2DConditionModel`) that is shown a render of a reconstruction from few views, its alpha, its",
         "uncertainty and the nearest input views carried over by its depth, and answers with the image that should be",
-        "there (x0). It takes no words. It knows objects like those listed below and nothing else; on photographs of",
+        f"there (x0). {_words(measured)} It knows objects like those listed below and nothing else; on photographs of",
         "rooms or landscapes it is a denoiser at best.",
         "",
         f"- {parameters / 1e6:.1f} million parameters, float16, {lessons.size} px; torch {torch.__version__}",
@@ -80,6 +80,7 @@ def model_card(
         "## Measured on the held-out scenes",
         "",
         *_table(measured),
+        *_understood(measured),
         "",
         "## Training data",
         "",
@@ -89,6 +90,23 @@ def model_card(
         "",
     ]
     return "\n".join(lines)
+
+
+def _words(measured: Mapping[str, Any]) -> str:
+    if "words" not in measured:
+        return "It takes no words."
+    return "It attends to the tokens of a small CLIP (`clip/`) that learned the captions of the same scenes."
+
+
+def _understood(measured: Mapping[str, Any]) -> list[str]:
+    words = measured.get("words")
+    if not words:
+        return []
+    return [
+        "",
+        f"Of the words in {words['captions']} held-out captions its CLIP never met {words['unknown_words']:.0%}; a "
+        f"picture fits its own caption best in {words['right_caption']:.0%} (by guessing {words['by_guessing']:.0%}).",
+    ]
 
 
 def _table(measured: Mapping[str, Any]) -> list[str]:

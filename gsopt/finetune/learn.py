@@ -18,6 +18,7 @@ from gsopt.events import write_atomic
 from gsopt.finetune.course import Course
 from gsopt.finetune.fits import Pairs
 from gsopt.finetune.lessons import Batch, draw
+from gsopt.finetune.told import Told
 from gsopt.sds.noise import generator
 from gsopt.sds.view_prior import cosine_schedule, predict
 
@@ -29,8 +30,8 @@ STATE = "training.safetensors"
 class Training:
     """Network, averaged weights and optimizer of one course."""
 
-    def __init__(self, unet: Any, course: Course) -> None:
-        self.unet, self.course, self.step = unet.train(), course, 0
+    def __init__(self, unet: Any, course: Course, told: Told | None = None) -> None:
+        self.unet, self.course, self.told, self.step = unet.train(), course, told, 0
         self.average = {name: value.detach().clone() for name, value in unet.state_dict().items()}
         self.optimizer = torch.optim.AdamW(
             unet.parameters(), lr=course.lr, weight_decay=course.weight_decay, betas=(0.9, 0.99), fused=True
@@ -39,7 +40,8 @@ class Training:
 
     def advance(self, pairs: Pairs) -> float:
         """One step; its loss. NumericalError when that is not finite: the last saved state is the good one."""
-        batch = draw(pairs, self.course.batch, self.noise, generator(self.course.seed, self.step, 0, "lessons"))
+        random = generator(self.course.seed, self.step, 0, "lessons")
+        batch = draw(pairs, self.course.batch, self.noise, random, self.told)
         found = loss(self.unet, batch)
         if not bool(torch.isfinite(found)):
             raise NumericalError(f"The loss of step {self.step} is {float(found)}. Lower --lr and run again.")
@@ -110,7 +112,7 @@ class Training:
 
 def loss(unet: Any, batch: Batch) -> Tensor:
     """Mean squared error of x0_hat, and of its differences along both axes."""
-    error = predict(unet, batch.x_t, batch.t, batch.planes) - batch.x0
+    error = predict(unet, batch.x_t, batch.t, batch.planes, batch.said) - batch.x0
     edges = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
     return error.square().mean() + EDGE_WEIGHT * edges
 

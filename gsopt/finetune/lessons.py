@@ -11,12 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gsopt.finetune.fits import Pairs
+from gsopt.finetune.told import Told
 from gsopt.sds.noise import Latents, NoiseSchedule, add_noise
-from gsopt.sds.view_prior import STEPS, WARPED, weighed
+from gsopt.sds.view_prior import STEPS, WARPED, Said, weighed
 
 SIDE = 64
 """Of the images that are learned from, px."""
@@ -39,6 +40,7 @@ class Batch:
     t: Int[Tensor, "B"]
     planes: Float[Tensor, "B C S S"]
     """See `condition_planes`."""
+    said: Said
 
 
 @dataclass(frozen=True)
@@ -69,11 +71,13 @@ def on_background(pairs: Pairs, background: Float[Tensor, "B 3"]) -> Images:
     )
 
 
-def draw(pairs: Pairs, count: int, noise: NoiseSchedule, random: torch.Generator) -> Batch:
-    """A batch of `count` lessons."""
+def draw(pairs: Pairs, count: int, noise: NoiseSchedule, random: torch.Generator, told: Told | None = None) -> Batch:
+    """A batch of `count` lessons. What words are said about keeps its colors."""
     rows = torch.randint(len(pairs), (count,), generator=random)
     cut = Pairs(*(torch.cat(parts) for parts in zip(*(_cut(pairs, int(row), random) for row in rows), strict=True)))
-    images = _recolored(on_background(cut, backgrounds(count, random)), random)
+    said = Said.nothing(count) if told is None else told.draw(rows, random)
+    silent = said.tokens.flatten(1).any(1).logical_not()
+    images = _recolored(on_background(cut, backgrounds(count, random)), silent, random)
     x0 = 2 * images.truth - 1
     repair = torch.rand(count, generator=random) < REPAIR_SHARE
     low, high = REPAIR_T
@@ -84,7 +88,7 @@ def draw(pairs: Pairs, count: int, noise: NoiseSchedule, random: torch.Generator
     )
     clean = torch.where(repair[:, None, None, None], 2 * images.render[:, :3] - 1, x0)
     x_t = add_noise(clean, torch.randn(x0.shape, generator=random), noise.signal(t, x0))
-    return Batch(x0, x_t, t, _forgotten(images.planes, repair, random))
+    return Batch(x0, x_t, t, _forgotten(images.planes, repair, random), said)
 
 
 def backgrounds(count: int, random: torch.Generator) -> Float[Tensor, "B 3"]:
@@ -117,11 +121,11 @@ def _crop(planes: Float[Tensor, "P S S"], random: torch.Generator) -> Float[Tens
     return planes[:, top : top + SIDE, left : left + SIDE]
 
 
-def _recolored(images: Images, random: torch.Generator) -> Images:
-    """Channels exchanged and dimmed, the same in all images of a row."""
+def _recolored(images: Images, rows: Bool[Tensor, "B"], random: torch.Generator) -> Images:
+    """Channels of these rows exchanged and dimmed, the same in all images of a row."""
     count = len(images.truth)
-    order = torch.rand(count, 3, generator=random).argsort(1)
-    gain = 1 - 0.4 * torch.rand(count, 3, 1, 1, generator=random)
+    order = torch.where(rows[:, None], torch.rand(count, 3, generator=random).argsort(1), torch.arange(3))
+    gain = 1 - 0.4 * rows[:, None, None, None] * torch.rand(count, 3, 1, 1, generator=random)
     each = torch.arange(count)[:, None]
 
     def of(colors: Tensor) -> Tensor:

@@ -5,44 +5,56 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL import Image
 from torch import Tensor
 
 from gsopt.finetune.fits import Pairs
 from gsopt.finetune.lessons import on_background
+from gsopt.finetune.told import Told
 from gsopt.sds.noise import add_noise, generator
-from gsopt.sds.view_prior import cosine_schedule, predict
+from gsopt.sds.view_prior import Said, cosine_schedule, predict
 
 TIMES = (300, 500, 700, 900)
 MOST = 48
 """Renders that are measured, evenly spread over the held-out scenes."""
 SHOWN = 8
-SUBSETS: dict[str, tuple[bool, bool]] = {
-    "nothing": (False, False),
-    "render": (True, False),
-    "references": (False, True),
-    "render, references": (True, True),
+SUBSETS: dict[str, tuple[bool, bool, bool]] = {
+    "nothing": (False, False, False),
+    "words": (False, False, True),
+    "render": (True, False, False),
+    "references": (False, True, False),
+    "render, references": (True, True, False),
+    "render, references, words": (True, True, True),
 }
-"""Whether the render (with its uncertainty) and the references are known."""
+"""Whether the render (with its uncertainty), the references, and what can be said of the scene are known."""
 
 
 @torch.no_grad()
-def measure(unet: Any, pairs: Pairs) -> dict[str, Any]:
+def measure(unet: Any, pairs: Pairs, told: Told | None = None) -> dict[str, Any]:
     """Mean PSNR in dB on white, over held-out renders: `render` and `reference` (the nearest one, carried over; white
-    where it is not trusted) as they are; `repair`, one step from the noisy render, per noise step; `x0`, one step from
-    the noisy truth, per noise step and subset of conditions."""
-    chosen = _spread(pairs, MOST)
+    where it is not trusted) as they are; `repair`, one step from the noisy render, per noise step, everything known;
+    `x0`, one step from the noisy truth, per noise step and subset of conditions."""
+    rows = _spread(pairs, MOST)
+    chosen = pairs.rows(rows)
+    said = None if told is None else told.full(rows)
     white = torch.ones(len(chosen), 3)
     images = on_background(chosen, white)
     copied = images.warped[:, 0, :3] * images.warped[:, 0, 3:] + (1 - images.warped[:, 0, 3:])
     everything = images.planes
     repair = {
-        str(t): psnr(_asked(unet, images.render[:, :3], everything, t), images.truth) for t in (50, 100, 200, *TIMES)
+        str(t): psnr(_asked(unet, images.render[:, :3], everything, t, said), images.truth)
+        for t in (50, 100, 200, *TIMES)
     }
     x0 = {
-        name: {str(t): psnr(_asked(unet, images.truth, _known(everything, *known), t), images.truth) for t in TIMES}
-        for name, known in SUBSETS.items()
+        name: {
+            str(t): psnr(
+                _asked(unet, images.truth, _known(everything, *known), t, said if words else None), images.truth
+            )
+            for t in TIMES
+        }
+        for name, (*known, words) in SUBSETS.items()
+        if said is not None or not words
     }
     return {
         "renders": len(chosen),
@@ -62,7 +74,7 @@ def _known(planes: Float[Tensor, "M C S S"], render: bool, references: bool) -> 
     return planes
 
 
-def _asked(unet: Any, images: Tensor, planes: Tensor, t: int) -> Float[Tensor, "M 3 S S"]:
+def _asked(unet: Any, images: Tensor, planes: Tensor, t: int, said: Said | None) -> Float[Tensor, "M 3 S S"]:
     """x0_hat of noisy images, 0..1."""
     noise = cosine_schedule()
     rows = []
@@ -71,7 +83,8 @@ def _asked(unet: Any, images: Tensor, planes: Tensor, t: int) -> Float[Tensor, "
         eps = torch.randn(x.shape, generator=generator(0, t, m, "measure"))
         steps = torch.tensor([t])
         x_t = add_noise(x, eps, noise.signal(steps, x))
-        rows.append((predict(unet, x_t, steps, planes[m : m + 1]) / 2 + 0.5).clamp(0, 1))
+        own = None if said is None else Said(said.tokens[m : m + 1], said.heard[m : m + 1])
+        rows.append((predict(unet, x_t, steps, planes[m : m + 1], own) / 2 + 0.5).clamp(0, 1))
     return torch.cat(rows)
 
 
@@ -82,17 +95,17 @@ def psnr(images: Tensor, truth: Tensor) -> float:
 
 
 @torch.no_grad()
-def sheet(unet: Any, pairs: Pairs) -> Image.Image:
+def sheet(unet: Any, pairs: Pairs, told: Told | None = None) -> Image.Image:
     """Per row: the truth, the render, its repair at t = 100 and 300, and the nearest reference carried over."""
-    chosen = _spread(pairs, SHOWN)
+    rows = _spread(pairs, SHOWN)
+    chosen, said = pairs.rows(rows), None if told is None else told.full(rows)
     images = on_background(chosen, torch.ones(len(chosen), 3))
     copied = images.warped[:, 0, :3] * images.warped[:, 0, 3:]
-    repaired = [_asked(unet, images.render[:, :3], images.planes, t) for t in (100, 300)]
+    repaired = [_asked(unet, images.render[:, :3], images.planes, t, said) for t in (100, 300)]
     columns = [images.truth, images.render[:, :3], *repaired, copied]
-    rows = torch.cat([torch.cat(list(column), 1) for column in columns], 2)
-    return Image.fromarray((rows.permute(1, 2, 0) * 255).round().byte().numpy())
+    picture = torch.cat([torch.cat(list(column), 1) for column in columns], 2)
+    return Image.fromarray((picture.permute(1, 2, 0) * 255).round().byte().numpy())
 
 
-def _spread(pairs: Pairs, most: int) -> Pairs:
-    rows = torch.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().long()
-    return Pairs(*(tensor[rows] for tensor in vars(pairs).values()))
+def _spread(pairs: Pairs, most: int) -> Int[Tensor, "m"]:
+    return torch.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().long()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,27 +12,27 @@ from typing import Any
 import torch
 
 from gsopt import check
-from gsopt.data.files import is_regular, read_json
+from gsopt.data.files import read_json
 from gsopt.data.scene import is_posed
 from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
 from gsopt.finetune.course import Course
-from gsopt.finetune.fits import Pairs, make_pairs
 from gsopt.finetune.folder import write_folder
 from gsopt.finetune.learn import STATE, Training
+from gsopt.finetune.library import Library, Say, collect
 from gsopt.finetune.measure import measure, sheet
+from gsopt.finetune.told import Told, tell
+from gsopt.finetune.words import find_encoder, said_of_all, words_known
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.sds.choice import EMBEDDED
-from gsopt.sds.view_prior import CARD, ViewPrior, is_view_prior, make_unet
+from gsopt.sds.view_prior import CARD, CLIP, ViewPrior, is_view_prior, make_deaf, make_unet
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""
 NEWS = 0.02
 """Share of a new loss in the running mean that is shown."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -93,40 +93,27 @@ def finetune(
     that holds something else.
     """
     _claim(out, lessons, course, base)
-    train = collect(lessons.train, lessons, out / "pairs", backend, say)
-    val = collect(lessons.val, lessons, out / "pairs", backend, say) if lessons.val else None
-    say(f"{len(train)} renders of {len(lessons.train)} scenes to learn from, {len(val) if val else 0} held out")
-    training = Training(make_unet(course.seed) if base is None else _base(base), course)
+    train, val = (_library(scenes, lessons, out / "pairs", backend, say) for scenes in (lessons.train, lessons.val))
+    assert train is not None
+    held = 0 if val is None else len(val.pairs)
+    say(f"{len(train.pairs)} renders of {len(lessons.train)} scenes to learn from, {held} held out")
+    encoder = find_encoder(train, course, out / CLIP, base, say)
+    told, told_val = (
+        None if encoder is None or part is None else tell(encoder, part, said_of_all(part)) for part in (train, val)
+    )
+    training = Training(make_unet(course.seed) if base is None else _base(base, told is not None), course, told)
     if (out / STATE).exists():
         training.restore(out / STATE)
         say(f"continuing at step {training.step}")
     if training.step == course.steps and (out / CARD).exists():
         return dict(read_json(out / CARD).get("measured") or {})
-    training.run(train, out, _Log(out, course, training, val, say))
+    training.run(train.pairs, out, _Log(out, training, val, told_val, say))
     unet = training.averaged()
-    measured = measure(unet, val) if val else {}
+    measured = {} if val is None else measure(unet, val.pairs, told_val)
+    if encoder is not None and val is not None:
+        measured |= {"words": words_known(encoder, val)}
     write_folder(out, unet, lessons, course, base, measured)
     return measured
-
-
-def collect(scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Backend, say: Say) -> Pairs:
-    """All pairs of the scenes; what is not in `folder` is made. A scene that cannot be fitted is named and left out."""
-    folder.mkdir(parents=True, exist_ok=True)
-    parts = []
-    for scene in scenes:
-        for fit in range(lessons.fits):
-            path = folder / f"{scene.name}_{fit}.safetensors"
-            if not is_regular(path):
-                try:
-                    make_pairs(scene, lessons.size, fit, lessons.seed, backend).save(path)
-                except InputError as error:
-                    say(f"{scene.name} is left out: {error}")
-                    break
-                say(f"fitted {scene.name}, {fit + 1} of {lessons.fits}")
-            parts.append(Pairs.load(path))
-    if not parts:
-        raise InputError(f"None of the {len(scenes)} scenes could be reconstructed. See the messages above.")
-    return Pairs.cat(parts)
 
 
 def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> None:
@@ -151,17 +138,28 @@ def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> No
     write_atomic(path, to_json(plan))
 
 
-def _base(folder: Path) -> Any:
+def _library(scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Backend, say: Say) -> Library | None:
+    if not scenes:
+        return None
+    return collect(scenes, lessons.fits, lessons.size, lessons.seed, folder, backend, say)
+
+
+def _base(folder: Path, told: bool) -> Any:
+    """The network to start from; one that was never told anything goes on as it was."""
     if not is_view_prior(folder):
         raise InputError(f"`--base` {folder} is no view-conditioned prior. Give a folder that `gsopt finetune` wrote.")
-    return ViewPrior(folder, GuidanceConfig()).unet.requires_grad_(True)
+    unet = ViewPrior(folder, GuidanceConfig()).unet.requires_grad_(True)
+    if told and not (folder / CLIP).is_dir():
+        make_deaf(unet)
+    return unet
 
 
 class _Log:
     """Hears every step: a line now and then, train.jsonl, and sample sheets of held-out renders."""
 
-    def __init__(self, out: Path, course: Course, training: Training, val: Pairs | None, say: Say) -> None:
-        self._out, self._course, self._training, self._val, self._say = out, course, training, val, say
+    def __init__(self, out: Path, training: Training, val: Library | None, told: Told | None, say: Say) -> None:
+        self._out, self._course, self._training, self._say = out, training.course, training, say
+        self._val, self._told = val, told
         self._mean: float | None = None
         self._began, self._first = time.monotonic(), training.step
 
@@ -182,5 +180,5 @@ class _Log:
         folder.mkdir(exist_ok=True)
         assert self._val is not None
         with torch.no_grad():
-            sheet(unet, self._val).save(folder / f"step_{step:06d}.png")
+            sheet(unet, self._val.pairs, self._told).save(folder / f"step_{step:06d}.png")
         self._training.back()

@@ -6,6 +6,7 @@ Every model is loaded with an explicit dtype (transformers takes the checkpoint'
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ LONGEST = 77
 """Tokens of CLIP's text models."""
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Of CLIP's training images (Radford et al. 2021); a preprocessor_config.json may say otherwise."""
+SMALL_VOCABULARY = 8192
+"""Tokens; CLIP's own has 49,408. The priors that `gsopt finetune` makes learn one token per word of their captions."""
 ROWS = 8
 """Texts or images that are encoded at once."""
 
@@ -78,6 +81,14 @@ class ClipEncoder:
 
     def length(self, text: str) -> int:
         return len(self._text.tokenizer(text, truncation=False).input_ids)
+
+    def unknown_words(self, text: str) -> list[str]:
+        """A small vocabulary is one of whole words: what it spells out it never met."""
+        tokenizer = self._text.tokenizer
+        if len(tokenizer) > SMALL_VOCABULARY:
+            return []
+        words = dict.fromkeys(re.findall(r"[^\W\d_]+", text.lower()))
+        return [word for word in words if len(tokenizer.tokenize(word)) > 1]
 
     @torch.no_grad()
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "n L D"]:
@@ -145,7 +156,11 @@ def _normalisation(file: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _transformers() -> Any:
-    return require("transformers", "sds", "Encoding prompts")
+    """Without its reports on weights of the half of a CLIP that is not wanted."""
+    transformers = require("transformers", "sds", "Encoding prompts")
+    transformers.utils.logging.set_verbosity_error()
+    transformers.utils.logging.disable_progress_bar()
+    return transformers
 
 
 def _loaded(kind: Any, folder: Path, **options: Any) -> Any:

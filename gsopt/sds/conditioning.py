@@ -142,9 +142,10 @@ def encode(
     embeddings = _image_embeddings(encoder, inputs, references)
     scored, notes = _scored(encoder, prompts, inputs)
     notes += [_cut(p, encoder) for p in prompts if encoder.length(p.text) > encoder.longest]
+    notes += [_unknown(p, words) for p in prompts if (words := encoder.unknown_words(p.text))]
     image_tokens = None
     if embeddings is not None and image_weight > 0:
-        image_tokens, note = _matched(embeddings, tokens, image_weight)
+        image_tokens, note = matched(embeddings, tokens, image_weight)
         notes += note
     elif len(references) and embeddings is None:
         notes.append(NO_IMAGE_ENCODER)
@@ -176,7 +177,7 @@ def _image_embeddings(encoder: Encoder, inputs: Images, references: Images) -> F
     return torch.cat(rows) if rows else None
 
 
-def _matched(
+def matched(
     embeddings: Float[Tensor, "m E"], tokens: Float[Tensor, "n L D"], weight: float
 ) -> tuple[Float[Tensor, "m D"] | None, list[str]]:
     """Embeddings with the root mean square of the text tokens, times the weight."""
@@ -191,19 +192,26 @@ def _matched(
 
 def _scored(encoder: Encoder, prompts: Sequence[Prompt], inputs: Images) -> tuple[tuple[Prompt, ...], list[str]]:
     """The prompts with their mean alignment with the input views, and a warning for every bad one."""
-    positive = [prompt for prompt in prompts if prompt.polarity == "positive"]
+    positive = [p for p in prompts if p.polarity == "positive" and not encoder.unknown_words(p.text)]
     alignment = encoder.alignment([NEUTRAL, *(p.text for p in positive)], inputs) if positive and len(inputs) else None
     if alignment is None:
         return tuple(prompts), []
     neutral, *scores = [round(score, 4) for score in alignment.mean(1).clamp(-1, 1).tolist()]
     found = iter(scores)
-    scored = tuple(dataclasses.replace(p, score=next(found)) if p.polarity == "positive" else p for p in prompts)
-    bad = [p for p in scored if p.score is not None and p.polarity == "positive" and p.score < neutral]
+    scored = tuple(dataclasses.replace(p, score=next(found)) if p in positive else p for p in prompts)
+    bad = [p for p in scored if p.score is not None and p.score < neutral]
     return scored, [
         f"The prompt {p.text[:60]!r} fits the input views worse ({p.score:.3f}) than {NEUTRAL!r} ({neutral:.3f}): "
         "such prompts can lower the quality. Rephrase or drop it."
         for p in bad
     ]
+
+
+def _unknown(prompt: Prompt, words: Sequence[str]) -> str:
+    return (
+        f"The prior never met {', '.join(map(repr, words[:5]))} of the prompt {prompt.text[:60]!r}: there it guesses "
+        "from the spelling. Say it in common words, or name a prior that knows more with --prior."
+    )
 
 
 def _cut(prompt: Prompt, encoder: Encoder) -> str:

@@ -69,6 +69,10 @@ class Encoder(Protocol):
         """Tokens of a text, begin and end included."""
         ...
 
+    def unknown_words(self, text: str) -> list[str]:
+        """Words of a text that it never met; none where its vocabulary is that of the web."""
+        ...
+
     @property
     def longest(self) -> int:
         """Tokens that are read; what a text has beyond is cut off."""

@@ -4,8 +4,9 @@
 
 r is the current render, u its uncertainty (`coverage`), w_k the input views carried into the camera by the render's
 depth with confidence c_k (`warp`): all aligned, pixel by pixel. f predicts what is wrong with the render; an untrained
-network changes nothing. It works on pixels in [-1, 1], cut into PATCH x PATCH tiles for speed (Li & He 2025: x0 is the
-prediction that patches of pixels need), on sides that are multiples of SIDE_MULTIPLE.
+network changes nothing. Where the folder holds a CLIP, f attends to the tokens of words and pictures as well. It works
+on pixels in [-1, 1], cut into PATCH x PATCH tiles for speed (Li & He 2025: x0 is the prediction that patches of pixels
+need), on sides that are multiples of SIDE_MULTIPLE.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError
 from torch import Tensor
 
 from gsopt._optional import require
 from gsopt.errors import InputError, UsageError
 from gsopt.guidance_config import GuidanceConfig
+from gsopt.sds.clip import ClipEncoder, load_joint_clip
 from gsopt.sds.noise import Latents, NoiseSchedule
 from gsopt.sds.prior import Condition, Encoder, Images
 from gsopt.sds.warp import warp
@@ -36,6 +38,8 @@ CHANNELS = 3 + 4 + 1 + 4 * WARPED
 """Of x_t, the render with alpha, its uncertainty, and the references with their confidence."""
 WIDTHS = (96, 128, 192)
 TOKEN_WIDTH = 192
+CLIP = "clip"
+"""Folder of the CLIP whose words and pictures the network knows, in the prior's; a prior without one takes none."""
 STEPS = 1000
 CARD = "gsopt_prior.json"
 """Marks a folder as this kind of prior."""
@@ -47,6 +51,28 @@ class Card:
 
     size: int
     """Side of the renders it was trained for, px."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """Tokens for cross-attention, row by row."""
+
+    tokens: Float[Tensor, "B L D"]
+    heard: Bool[Tensor, "B L"]
+    """The others only fill up."""
+
+    @staticmethod
+    def nothing(count: int) -> Said:
+        """A token of zeros: it adds nothing."""
+        return Said(torch.zeros(count, 1, TOKEN_WIDTH), torch.ones(count, 1, dtype=torch.bool))
+
+    @staticmethod
+    def by(conditions: Sequence[Condition]) -> Said:
+        """What these conditions say."""
+        rows = [torch.zeros(1, TOKEN_WIDTH) if c.tokens is None else c.tokens for c in conditions]
+        heard = [torch.ones(len(row), dtype=torch.bool) for row in rows]
+        pad = torch.nn.utils.rnn.pad_sequence
+        return Said(pad(rows, batch_first=True), pad(heard, batch_first=True))
 
 
 class ViewPrior:
@@ -101,18 +127,25 @@ class ViewPrior:
     def denoise(self, x_t: Latents, t: Int[Tensor, "B"], conditions: Sequence[Condition]) -> Latents:
         """Equation (1)."""
         planes = torch.stack([condition_planes(condition, x_t.shape[-1]) for condition in conditions])
-        return predict(self.unet, x_t, t, planes)
+        return predict(self.unet, x_t, t, planes, Said.by(conditions))
 
     def encoder(self) -> Encoder | None:
-        """None: this network was not taught words."""
-        return None
+        """None where the network was not taught words."""
+        folder = self.folder / CLIP
+        if not folder.is_dir():
+            return None
+        clip = load_joint_clip(folder, torch.float32)
+        return ClipEncoder(f"{self.folder.name}/{CLIP}", clip.text, clip.image, clip)
 
 
-def predict(unet: Any, x_t: Latents, t: Int[Tensor, "B"], planes: Float[Tensor, "B C S S"]) -> Latents:
+def predict(
+    unet: Any, x_t: Latents, t: Int[Tensor, "B"], planes: Float[Tensor, "B C S S"], said: Said | None = None
+) -> Latents:
     """Equation (1); differentiable in the network's weights."""
+    said = Said.nothing(len(x_t)) if said is None else said
     stacked = torch.nn.functional.pixel_unshuffle(torch.cat([x_t, planes], 1), PATCH)
-    nothing_said = torch.zeros(len(x_t), 1, TOKEN_WIDTH)
-    residual = unet(stacked, t, encoder_hidden_states=nothing_said).sample
+    mask = None if bool(said.heard.all()) else said.heard
+    residual = unet(stacked, t, encoder_hidden_states=said.tokens, encoder_attention_mask=mask).sample
     return planes[:, :3] + torch.nn.functional.pixel_shuffle(residual, PATCH)
 
 
@@ -176,6 +209,13 @@ def make_unet(seed: int) -> Any:
     torch.nn.init.zeros_(unet.conv_out.weight)
     torch.nn.init.zeros_(unet.conv_out.bias)
     return unet
+
+
+def make_deaf(unet: Any) -> None:
+    """Let a network that was never told anything ignore what it will be told, until it learns to listen."""
+    for name, module in unet.named_modules():
+        if name.endswith("attn2.to_v"):
+            torch.nn.init.zeros_(module.weight)
 
 
 def is_view_prior(folder: Path) -> bool:

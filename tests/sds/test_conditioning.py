@@ -27,8 +27,17 @@ class FakeEncoder:
     name = "fake"
     longest = 77
 
-    def __init__(self, width: int = 3, aligned: dict[str, float] | None = None, has_images: bool = True) -> None:
-        self.width, self.aligned, self.has_images = width, aligned, has_images
+    def __init__(
+        self,
+        width: int = 3,
+        aligned: dict[str, float] | None = None,
+        has_images: bool = True,
+        unknown: tuple[str, ...] = (),
+    ) -> None:
+        self.width, self.aligned, self.has_images, self.unknown = width, aligned, has_images, unknown
+
+    def unknown_words(self, text: str) -> list[str]:
+        return [word for word in text.split() if word in self.unknown]
 
     def texts(self, texts):
         return torch.tensor([[[float(len(text) + 1)] * self.width] * 2 for text in texts])
@@ -136,6 +145,15 @@ def test_a_badly_aligned_prompt_is_scored_and_warned_about() -> None:
     )
     assert [prompt.score for prompt in found.prompts] == [pytest.approx(0.3), pytest.approx(0.1), None]
     assert [("fish" in note, "chair" in note) for note in found.notes] == [(True, False)]
+
+
+def test_words_that_were_never_met_are_named_and_not_scored() -> None:
+    """A score would only say how their letters sound to the encoder."""
+    encoder = FakeEncoder(aligned={"a femur": 0.1}, unknown=("femur",))
+    found = made([Prompt("a femur"), Prompt("a chair")], encoder, torch.rand(2, 3, 8, 8))
+    assert [prompt.score for prompt in found.prompts] == [None, pytest.approx(0.2)]
+    assert [note for note in found.notes if "'femur'" in note and "--prior" in note]
+    assert not [note for note in found.notes if "chair" in note]
 
 
 def test_a_long_prompt_is_cut_and_said_to_be() -> None:

@@ -1,0 +1,150 @@
+"""A small CLIP (Radford et al. 2021) of the scenes a prior learns from: their captions and their pictures in one space.
+
+It knows the words of these captions and nothing else. Its tokenizer makes one token of every word it has met, so that a
+word in several tokens is one it never met (`unknown_words`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt._optional import require
+from gsopt.finetune.captions import common_texts
+from gsopt.finetune.library import Library, Say
+from gsopt.sds.clip import LONGEST, MEAN, STD
+from gsopt.sds.noise import generator
+from gsopt.sds.prior import Images
+from gsopt.sds.view_prior import TOKEN_WIDTH
+
+SIDE, PATCH = 64, 8
+"""Of the pictures and of their patches, px."""
+TEXT_LAYERS, IMAGE_LAYERS, IMAGE_WIDTH = 2, 3, 160
+SCENES = 48
+"""Told apart in one step."""
+RATE, DECAY = 1e-3, 0.1
+WARM_SHARE = 0.05
+SHARPEST = 50.0
+"""Upper bound of the learned factor on cosines."""
+SMALLEST_CUT = 0.6
+"""Share of a picture's side that is kept at least."""
+BEGIN, END = "<|startoftext|>", "<|endoftext|>"
+
+
+def make_tokenizer(texts: Sequence[str]) -> Any:
+    """Byte pairs merged until every word of `texts` is one token; any other word is spelled out."""
+    trainers = require("tokenizers", "sds", "Training a tokenizer").trainers
+    kind = require("transformers", "sds", "Training a tokenizer").CLIPTokenizer
+    learner = kind().backend_tokenizer
+    learner.train_from_iterator(
+        list(texts),
+        trainers.BpeTrainer(vocab_size=1 << 16, min_frequency=1, end_of_word_suffix="</w>", show_progress=False),
+    )
+    merges = [tuple(pair) for pair in json.loads(learner.to_str())["model"]["merges"]]
+    alphabet = sorted(require("tokenizers", "sds", "Training a tokenizer").pre_tokenizers.ByteLevel.alphabet())
+    symbols = [*alphabet, *(letter + "</w>" for letter in alphabet), *(a + b for a, b in merges), BEGIN, END]
+    vocabulary = {symbol: number for number, symbol in enumerate(dict.fromkeys(symbols))}
+    return kind(vocab=vocabulary, merges=merges, model_max_length=LONGEST)
+
+
+def make_clip(tokenizer: Any, seed: int) -> Any:
+    """An untrained CLIPModel."""
+    transformers = require("transformers", "sds", "Training a CLIP")
+    torch.manual_seed(seed)
+    text = {
+        "vocab_size": len(tokenizer),
+        "hidden_size": TOKEN_WIDTH,
+        "projection_dim": TOKEN_WIDTH,
+        "intermediate_size": 3 * TOKEN_WIDTH,
+        "num_hidden_layers": TEXT_LAYERS,
+        "num_attention_heads": 4,
+        "max_position_embeddings": LONGEST,
+        "bos_token_id": tokenizer.bos_token_id,
+        "eos_token_id": tokenizer.eos_token_id,
+        "pad_token_id": tokenizer.pad_token_id,
+    }
+    image = {
+        "hidden_size": IMAGE_WIDTH,
+        "projection_dim": TOKEN_WIDTH,
+        "intermediate_size": 3 * IMAGE_WIDTH,
+        "num_hidden_layers": IMAGE_LAYERS,
+        "num_attention_heads": 4,
+        "image_size": SIDE,
+        "patch_size": PATCH,
+    }
+    return transformers.CLIPModel(
+        transformers.CLIPConfig(text_config=text, vision_config=image, projection_dim=TOKEN_WIDTH)
+    )
+
+
+def train_clip(library: Library, said: Sequence[tuple[str, ...]], steps: int, seed: int, say: Say) -> tuple[Any, Any]:
+    """A CLIPModel and its tokenizer, trained to tell the scenes of the library apart; `said` are their texts."""
+    tokenizer = make_tokenizer([text for texts in said for text in texts] + list(common_texts()))
+    model = make_clip(tokenizer, seed).train()
+    optimizer = torch.optim.AdamW(model.parameters(), lr=RATE, weight_decay=DECAY, fused=True)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps + 1, pct_start=WARM_SHARE)
+    mean = 0.0
+    for step in range(steps):
+        random = generator(seed, step, 0, "clip")
+        chosen = [int(i) for i in torch.randperm(len(said), generator=random)[:SCENES] if said[int(i)]]
+        pictures = torch.stack([_picture(library, index, random) for index in chosen])
+        texts = [said[index][int(torch.randint(len(said[index]), (1,), generator=random))] for index in chosen]
+        found = contrast(model, tokenizer, pictures, texts, [said[index][0] for index in chosen])
+        optimizer.zero_grad(set_to_none=True)
+        found.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        rate.step()
+        with torch.no_grad():
+            model.logit_scale.clamp_(max=float(torch.tensor(SHARPEST).log()))
+        mean = float(found.detach()) if step == 0 else mean + 0.02 * (float(found.detach()) - mean)
+        if (step + 1) % 100 == 0:
+            say(f"words: step {step + 1}/{steps}  loss {mean:.4f}")
+    return model.eval().requires_grad_(False), tokenizer
+
+
+def contrast(model: Any, tokenizer: Any, pictures: Images, texts: list[str], captions: list[str]) -> Tensor:
+    """Which text belongs to which picture, both ways; equal captions count as one. What fits any scene prefers none."""
+    both = tokenizer([*texts, *common_texts()], padding="longest", truncation=True, return_tensors="pt").input_ids
+    normalize = torch.nn.functional.normalize
+    words = normalize(model.text_projection(model.text_model(both).pooler_output), dim=-1)
+    seen = normalize(model.visual_projection(model.vision_model(pictures).pooler_output), dim=-1)
+    logits = model.logit_scale.exp() * words @ seen.T
+    same = torch.tensor([[float(a == b) for b in captions] for a in captions])
+    same = same / same.sum(1, keepdim=True)
+    count = len(texts)
+    entropy = torch.nn.functional.cross_entropy
+    neutral = entropy(logits[count:], torch.full_like(logits[count:], 1 / count))
+    return (entropy(logits[:count], same) + entropy(logits[:count].T, same)) / 2 + 0.1 * neutral
+
+
+def _picture(library: Library, scene: int, random: torch.Generator) -> Float[Tensor, "3 s s"]:
+    """A view of the scene that was rendered from its mesh: cut, mirrored, on some background; as CLIP wants it."""
+    rows = torch.nonzero(library.scene == scene)[:, 0]
+    row = int(rows[torch.randint(len(rows), (1,), generator=random)])
+    rgba = library.pairs.truth[row].float() / 255
+    size = rgba.shape[-1]
+    side = int(size * (SMALLEST_CUT + (1 - SMALLEST_CUT) * float(torch.rand(1, generator=random))))
+    top, left = (int(torch.randint(size - side + 1, (1,), generator=random)) for _ in range(2))
+    rgba = rgba[:, top : top + side, left : left + side]
+    if int(torch.randint(2, (1,), generator=random)):
+        rgba = rgba.flip(2)
+    background = torch.ones(3) if float(torch.rand(1, generator=random)) < 0.5 else torch.rand(3, generator=random)
+    picture = rgba[:3] + (1 - rgba[3:]) * background[:, None, None]
+    picture = torch.nn.functional.interpolate(picture[None], (SIDE, SIDE), mode="bilinear", antialias=True)[0]
+    mean, std = (torch.tensor(values).view(3, 1, 1) for values in (MEAN, STD))
+    return (picture - mean) / std
+
+
+def save_clip(model: Any, tokenizer: Any, folder: Path) -> None:
+    """A folder that transformers opens, in half precision (`model` too, afterwards)."""
+    model.half().save_pretrained(folder, safe_serialization=True)
+    tokenizer.save_pretrained(folder)
+    for file in folder.iterdir():
+        file.chmod(0o644)

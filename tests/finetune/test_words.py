@@ -1,0 +1,144 @@
+"""A prior that is taught words: its CLIP learns captions and says what it never met; what is said is heard."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsopt.cli import main
+from gsopt.finetune import captions, fits, measure, run
+from gsopt.finetune.clip import make_tokenizer
+from gsopt.finetune.told import tell
+from gsopt.finetune.words import find_encoder, said_of_all, words_known
+from gsopt.guidance_config import GuidanceConfig
+from gsopt.sds.opening import open_prior
+from gsopt.sds.prior import Condition
+from gsopt.sds.view_prior import TOKEN_WIDTH, Said, make_deaf, make_unet, predict
+
+pytest.importorskip("diffusers")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
+from tiny_scenes import write_dataset
+
+SIZE = 64
+CAPTIONS = {"one": "a red cup", "two": "a blue table", "three": "a red table"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_fits() -> None:
+    fits.LENGTHS, measure.MOST = (12,), 2
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("told")
+    for name, caption in CAPTIONS.items():
+        write_dataset(root / name, train=6, test=2)
+        views = {"train_000": f"{caption}, seen from above"}
+        (root / name / "captions.json").write_text(json.dumps({"caption": caption, "views": views}))
+        (root / name / "object.json").write_text(json.dumps({"name": caption.split()[-1], "category": "Kitchen"}))
+    return root
+
+
+def command(scenes: Path, out: Path, *more: str) -> list[str]:
+    flags = ["--val", "three", "--fits", "1", "--size", str(SIZE), "--steps", "2", "--batch", "2", "--threads", "1"]
+    return ["finetune", str(scenes), "-o", str(out), *flags, "--clip-steps", "12", *more]
+
+
+@pytest.fixture(scope="module")
+def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("priors") / "told"
+    assert main(command(scenes, out)) == 0
+    return out
+
+
+def test_a_scene_is_described_by_what_lies_beside_it(scenes: Path, tmp_path: Path) -> None:
+    said = captions.said_of(scenes / "one")
+    assert said[0] == "a red cup"
+    assert {"a photo of a red cup", "cup, kitchen", "a red cup, back view", "a red cup, seen from above"} <= set(said)
+    assert captions.said_of(tmp_path) == ()
+    (tmp_path / "captions.json").write_text(json.dumps({"caption": "A\u202e\nCup " + "x" * 999, "views": 3}))
+    hostile = captions.said_of(tmp_path)
+    assert all(text.isprintable() and len(text) < 200 for text in hostile)
+    assert hostile[0].startswith("a cup")
+
+
+def test_every_word_that_was_met_is_one_token_and_no_other_is() -> None:
+    words = "a small red chair seen from directly above teapot"
+    tokenizer = make_tokenizer([words])
+    assert [tokenizer.decode([i]).strip() for i in tokenizer(words).input_ids[1:-1]] == words.split()
+    for unknown in ("femur", "chairs", "über", "中文"):
+        assert len(tokenizer.tokenize(unknown)) > 1
+        assert tokenizer.unk_token not in tokenizer.tokenize(unknown)
+
+
+def test_a_prior_with_captions_takes_words_and_one_without_does_not(prior: Path, scenes: Path, tmp_path: Path) -> None:
+    encoder = open_prior(str(prior), GuidanceConfig()).encoder()
+    assert encoder is not None
+    assert encoder.unknown_words("a red femur") == ["femur"]
+    assert encoder.texts(["", "a red cup"]).shape == (2, encoder.longest, TOKEN_WIDTH)
+    card = json.loads((prior / "gsopt_prior.json").read_text())["measured"]
+    assert card["words"]["unknown_words"] == 0
+    assert "render, references, words" in card["x0"]
+    assert "small CLIP" in (prior / "README.md").read_text()
+    assert main(command(scenes, tmp_path / "mute", "--clip-steps", "0")) == 0
+    assert open_prior(str(tmp_path / "mute"), GuidanceConfig()).encoder() is None
+    assert "takes no words" in (tmp_path / "mute" / "README.md").read_text()
+
+
+def test_a_prior_keeps_the_words_of_the_one_it_starts_from(prior: Path, scenes: Path, tmp_path: Path) -> None:
+    assert main(command(scenes, tmp_path / "next", "--base", str(prior))) == 0
+    for file in (prior / "clip").iterdir():
+        assert (tmp_path / "next" / "clip" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_what_is_said_reaches_the_network_and_silence_is_silence() -> None:
+    """Filling up changes nothing; a deaf network hears nothing; one that is not deaf hears every token."""
+    unet = make_unet(0)
+    torch.nn.init.normal_(unet.conv_out.weight, std=0.1)
+    x, t, planes = torch.randn(2, 3, 32, 32), torch.tensor([300, 300]), torch.zeros(2, 17, 32, 32)
+    tokens = torch.randn(5, TOKEN_WIDTH, generator=torch.Generator().manual_seed(0))
+    rows = [Condition(tokens=tokens), Condition(tokens=tokens[:3])]
+    with torch.no_grad():
+        both = predict(unet, x, t, planes, Said.by(rows))
+        alone = predict(unet, x[1:], t[1:], planes[1:], Said.by(rows[1:]))
+        torch.testing.assert_close(both[1:], alone, atol=1e-4, rtol=1e-3)
+        silent = predict(unet, x, t, planes)
+        torch.testing.assert_close(silent, predict(unet, x, t, planes, Said.by([Condition(), Condition()])))
+        assert float((both - silent).abs().max()) > 1e-3
+        make_deaf(unet)
+        torch.testing.assert_close(predict(unet, x, t, planes, Said.by(rows)), predict(unet, x, t, planes))
+
+
+def test_lessons_say_what_belongs_to_their_scene(prior: Path, scenes: Path) -> None:
+    """Some rows are told nothing, some the empty text; whoever hears a text hears one of their scene."""
+    library = run.collect([scenes / "one", scenes / "two"], 1, SIZE, 0, prior / "pairs", None, print)  # type: ignore[arg-type]
+    encoder = find_encoder(library, run.Course(), prior / "clip", None, print)
+    assert encoder is not None
+    told = tell(encoder, library, said_of_all(library))
+    rows = torch.arange(len(library.pairs)).repeat(8)
+    said = told.draw(rows, torch.Generator().manual_seed(0))
+    nothing = said.tokens.flatten(1).abs().sum(1) == 0
+    empty = (said.tokens[:, :-1] == told.tokens[0]).flatten(1).all(1)
+    assert 0.1 < float(nothing.float().mean()) < 0.6
+    assert 0.05 < float(empty.float().mean()) < 0.5
+    for row in torch.nonzero(~nothing & ~empty)[:, 0].tolist():
+        own = told.texts[int(library.scene[rows[row]])]
+        assert any(torch.equal(said.tokens[row, :-1], told.tokens[i]) for i in own)
+    assert 0 <= words_known(encoder, library)["right_caption"] <= 1
+
+
+def test_a_run_tells_the_prior_its_prompt(prior: Path, scenes: Path, tmp_path: Path) -> None:
+    """Different words, different Gaussians; the same words, the same bits."""
+    found = []
+    for number, prompt in enumerate(("a red cup", "a blue table", "a red cup")):
+        flags = ["--iterations", "16", "--prior", str(prior), "--guidance.guard-views", "0", "--guidance.every", "2"]
+        flags += ["--guidance.min-uncertainty", "0", "--init-count", "60", "--backend", "cpu", "--threads", "1"]
+        run_folder = tmp_path / str(number)
+        assert main(["train", str(scenes / "three"), "-m", str(run_folder), *flags, "--prompt", prompt]) == 0
+        found.append((run_folder / "splat.ply").read_bytes())
+    assert found[0] == found[2]
+    assert found[0] != found[1]
