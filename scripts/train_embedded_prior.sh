@@ -36,5 +36,5 @@ held_out=$(python -c 'import json, sys; print(*(row["id"] for row in json.load(o
 gsopt finetune "$out/train" "$out/val" -o "$out/first" --val $held_out --fits 1 --steps 2500 --lr 5e-4 --threads 1 \
     --clip-steps 0
 # shellcheck disable=SC2086
-gsopt finetune "$out/train" "$out/more" "$out/val" -o "$out/prior" --base "$out/first" --val $held_out --fits 2 \
-    --steps 3000 --lr 4e-4 --threads 1
+gsopt finetune "$out/train" "$out/more" "$out/val" -o "$out/prior" --base "$out/first" --val $held_out --fits 1 \
+    --steps 3200 --lr 4e-4 --threads 1
