@@ -8,7 +8,7 @@ silhouette holds them, so a point's accuracy is that of the masks and not of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,6 +18,7 @@ from gsopt.cameras import Cameras
 from gsopt.data.scene import Scene
 from gsopt.init.photos import Photo, colors_from_sums, sample, small_photos
 from gsopt.init.rig import Focus, find_focus, inside, project
+from gsopt.init.rounded import rounded
 
 SURFACE_SHARE = 0.7
 """Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and
@@ -25,6 +26,8 @@ what is carved away during training must find Gaussians behind it to take over. 
 and 1 (none inside) clearly worse."""
 MAX_PHOTOS = 100
 """Silhouettes used at most; more hardly carve."""
+FEW = 16
+"""Silhouettes from which on the hull itself is taken: it has hardly a corner left."""
 COARSE = 48
 """Voxels along each side of the first grid."""
 _LOOKUPS = 6e7
@@ -71,6 +74,9 @@ def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoi
     grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
     if grid is None:
         return None
+    if len(photos) < FEW:
+        cells = rounded(grid.occupied, grid.centers(grid.occupied), grid.voxel, photos)
+        grid = replace(grid, occupied=cells)
     xyz = _sample_points(grid, photos, count, generator)
     if len(xyz) == 0:
         return None

@@ -1,0 +1,94 @@
+"""The roundest shape in a hull: what thickness is, and what (1) keeps and takes away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from shapes import ellipsoid_scene, spread_cameras
+
+from gsopt.data.scene import load_scene
+from gsopt.init.hull import Grid, carve
+from gsopt.init.photos import Photo, small_photos
+from gsopt.init.rig import find_focus
+from gsopt.init.rounded import FAR, RATIO, rounded, squared_distance, thickest, thickness
+
+CENTER = (0.3, -0.2, 0.1)
+
+
+def hull_of(folder: Path, views: int, radii: tuple[float, float, float] = (0.7, 0.6, 0.65)) -> tuple[Grid, list[Photo]]:
+    scene = load_scene(ellipsoid_scene(folder, spread_cameras(views), CENTER, radii))
+    photos = small_photos(scene.train, views)
+    grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
+    assert grid is not None
+    return grid, photos
+
+
+def in_ellipsoid(grid: Grid, radii: tuple[float, float, float]) -> torch.Tensor:
+    centers = grid.centers(torch.ones_like(grid.occupied))
+    inside = ((centers - torch.tensor(CENTER)) / torch.tensor(radii)).norm(dim=1) <= 1
+    return inside.view(grid.occupied.shape)
+
+
+def test_the_distance_is_that_of_all_pairs() -> None:
+    cells = torch.rand(9, 7, 11, generator=torch.Generator().manual_seed(0)) < 0.02
+    everywhere = torch.nonzero(torch.ones_like(cells)).double()
+    exact = torch.cdist(everywhere, torch.nonzero(cells).double()).amin(1).square().round()
+    assert torch.equal(squared_distance(cells, 11).flatten().double(), exact)
+    near = squared_distance(cells, 2).flatten().double()
+    within = exact <= 4
+    assert torch.equal(near[within], exact[within])
+    assert bool((near >= exact).all())
+    assert bool((squared_distance(torch.zeros_like(cells), 3) == FAR).all())
+
+
+def test_the_thickness_of_a_ball_a_slab_and_a_rod() -> None:
+    """Each holds balls as large as itself, side by side in one grid."""
+    x, y, z = torch.meshgrid(*(torch.arange(60) for _ in range(3)), indexing="ij")
+    ball = (x - 15) ** 2 + (y - 15) ** 2 + (z - 15) ** 2 <= 12**2
+    slab = (x >= 35) & (x < 43) & (y > 0) & (y < 58) & (z > 0) & (z < 58)
+    rod = (y - 45) ** 2 + (z - 45) ** 2 <= 3**2
+    rod = rod & (x < 30)
+    thick = thickness(ball | slab | rod)
+    for part, radius in ((ball, 12), (slab, 4), (rod, 3)):
+        middle = thick[part].median()
+        assert radius / RATIO - 1 <= float(middle) <= radius + 1
+    assert bool((thick[~(ball | slab | rod)] == 0).all())
+    assert not bool(thickness(torch.zeros(4, 4, 4, dtype=torch.bool)).any())
+
+
+@pytest.mark.parametrize("views", [3, 4, 6])
+def test_what_lies_beside_a_ball_goes_and_the_ball_stays(views: int, tmp_path: Path) -> None:
+    radii = (0.65, 0.65, 0.65)
+    grid, photos = hull_of(tmp_path, views, radii)
+    kept = rounded(grid.occupied, grid.centers(grid.occupied), grid.voxel, photos)
+    ball = in_ellipsoid(grid, radii)
+    assert not bool((kept & ~grid.occupied).any())
+    assert int((kept & ~ball).sum()) < 0.5 * int((grid.occupied & ~ball).sum())
+    assert int((kept & ball).sum()) > 0.85 * int(ball.sum())
+
+
+def test_every_silhouette_remains_filled(tmp_path: Path) -> None:
+    grid, photos = hull_of(tmp_path, 4)
+    # With a thin antenna on top, which is a hull of its own where nothing thick stands before it.
+    cells = grid.occupied.clone()
+    x, y, top = (int(i) for i in torch.nonzero(cells)[torch.nonzero(cells)[:, 2].argmax()])
+    cells = torch.nn.functional.pad(cells, (0, 12))
+    cells[x : x + 2, y : y + 2, top : top + 12] = True
+    grid = Grid(cells, grid.low, grid.voxel)
+    kept = rounded(cells, grid.centers(cells), grid.voxel, photos)
+    assert float(kept[x : x + 2, y : y + 2, top + 6 : top + 12].float().mean()) == 1
+    for photo in photos:
+        points = grid.centers(cells)
+        full = thickest(photo, points, grid.voxel, torch.ones(len(points)))
+        filled = thickest(photo, points, grid.voxel, kept[cells].float())
+        seen = full.isfinite()
+        assert bool(seen.any())
+        assert bool((filled[seen] == 1).all())
+
+
+def test_what_no_photo_shows_stays(tmp_path: Path) -> None:
+    grid, photos = hull_of(tmp_path, 3)
+    far = grid.centers(grid.occupied) + 1e4
+    assert torch.equal(rounded(grid.occupied, far, grid.voxel, photos), grid.occupied)
