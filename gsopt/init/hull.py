@@ -2,7 +2,7 @@
 
 Carved on voxels, coarse to fine, then sampled: points are placed at random in the voxels and kept where every
 silhouette holds them, so a point's accuracy is that of the masks and not of the voxels (GaussianObject, Yang et al.
-2024, starts from such points).
+2024, starts from such points). Of the hull of few silhouettes only the round part is filled (`rounded`).
 """
 
 from __future__ import annotations
