@@ -15,38 +15,38 @@ struct alignas(64) BlockState {
 // Blends splat `i` of a chunk, entry `index` of its tile, into the blocks of `mask`. Returns the blocks that terminated.
 template <bool Depth, bool Count>
 inline uint32_t blend_splat(const Local& local, int i, int index, uint32_t mask, BlockState* states, Work& work) {
-  const Spread splat_i(local, i);
-  const px r = splat<px>(local.r[i]), g = splat<px>(local.g[i]), b = splat<px>(local.b[i]), depth = splat<px>(local.depth[i]);
-  const px t_min = splat<px>(kTransmittanceMin), threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
+  const Local::Row& row = local.row[i];
+  const px r = splat<px>(row.r), g = splat<px>(row.g), b = splat<px>(local.b[i]), depth = splat<px>(local.depth[i]);
+  const px t_min = splat<px>(kTransmittanceMin);
   const pxi here = splat_pxi(index);
+  Alphas alphas;
+  alphas_of<false>(Spread(row), mask, alphas);
   uint32_t finished = 0;
-  for (uint32_t rest = mask; rest; rest &= rest - 1) {
-    const int block = __builtin_ctz(rest);
-    BlockState& s = states[block];
-    const px e = exponent(splat_i, block).e, T = load_px(s.T);
-    const pxi pass = (e >= threshold) & (T > t_min);
-    const px weight = keep(pass, min(exp2(e), alpha_max)) * T, left = T - weight;
-    store_px(s.T, left);
+  int n = 0;
+  for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
+    BlockState& s = states[__builtin_ctz(rest)];
+    const px T = load_px(s.T);
+    const pxi alive = T > t_min;
+    const px weight = alphas.alpha[n] * keep(alive, T);
+    store_px(s.T, T - weight);
     store_px(s.r, load_px(s.r) + weight * r);
     store_px(s.g, load_px(s.g) + weight * g);
     store_px(s.b, load_px(s.b) + weight * b);
     if (Depth) store_px(s.depth, load_px(s.depth) + weight * depth);
-    store_pxi(s.last, max(load_pxi(s.last), pass & here));
-    finished |= any(left > t_min) ? 0 : rest & -rest;
-    if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(pass));
+    store_pxi(s.last, max(load_pxi(s.last), alive & here));
+    finished |= any(alive) ? 0 : rest & -rest;
+    if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(weight > splat<px>(0.f)));
   }
   return finished;
 }
 
 inline void write_block(const Frame& frame, const ForwardOutput& out, int tile, int block, const BlockState& s) {
   const float* bg = frame.background;
-  for_each_pixel(frame, tile, block, [&](int64_t pixel, int lane) {
-    const float T = s.T[lane];
-    out.colors[3 * pixel] = s.r[lane] + T * bg[0];
-    out.colors[3 * pixel + 1] = s.g[lane] + T * bg[1];
-    out.colors[3 * pixel + 2] = s.b[lane] + T * bg[2];
-    out.alphas[pixel] = 1.f - T;
-    if (out.depths) out.depths[pixel] = s.depth[lane];
+  for_each_row(frame, tile, block, [&](int64_t pixel, int lane, int n) {
+    const f4 T = load4(s.T + lane);
+    store_rgb(out.colors + 3 * pixel, {load4(s.r + lane) + T * bg[0], load4(s.g + lane) + T * bg[1], load4(s.b + lane) + T * bg[2]}, n);
+    store4_first(out.alphas + pixel, 1.f - T, n);
+    if (out.depths) store4_first(out.depths + pixel, load4(s.depth + lane), n);
   });
 }
 
@@ -57,13 +57,17 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
   BlockState states[kBlocks] = {};
   uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block)
-    for_each_pixel(frame, tile, block, [&](int64_t, int lane) { states[block].T[lane] = 1.f, alive |= 1u << block; });
+    for_each_row(frame, tile, block, [&](int64_t, int lane, int n) {
+      store4_first(states[block].T + lane, splat<f4>(1.f), n);
+      alive |= 1u << block;
+    });
   Local local;
   alignas(64) uint32_t touched[kChunk];
   uint32_t k = begin;
   for (uint32_t first = begin; first < end && alive; first += kChunk) {
     const int n = end - first < kChunk ? static_cast<int>(end - first) : kChunk;
-    load_chunk(frame, frame.entries.as<Entry>() + first, n, geometry, local, touched);
+    load_chunk(frame, frame.entries.as<Entry>() + first, n, geometry, local);
+    touched_blocks(local, n, touched);
     for (int i = 0; i < n && alive; ++i, ++k) {
       masks[k] = (frame.skips.tiles ? touched[i] : ~0u) & alive;
       const uint32_t finished = blend_splat<Depth, Count>(local, i, static_cast<int>(k - begin) + 1, masks[k], states, work);

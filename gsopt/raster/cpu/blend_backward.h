@@ -25,45 +25,45 @@ inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile,
   std::memcpy(out.T, frame.transmittance.as<float>() + at, sizeof(out.T));
   std::memcpy(out.last, frame.last.as<int32_t>() + at, sizeof(out.last));
   const float* bg = frame.background;
-  for_each_pixel(frame, tile, block, [&](int64_t pixel, int lane) {
-    const float *v = in.v_colors + 3 * pixel, v_alpha = in.v_alphas ? in.v_alphas[pixel] : 0.f;
-    out.r[lane] = v[0], out.g[lane] = v[1], out.b[lane] = v[2];
-    out.depth[lane] = in.v_depths ? in.v_depths[pixel] : 0.f;
-    out.behind[lane] = v[0] * bg[0] + v[1] * bg[1] + v[2] * bg[2] - v_alpha;
+  for_each_row(frame, tile, block, [&](int64_t pixel, int lane, int n) {
+    const Rgb v = load_rgb(in.v_colors + 3 * pixel, n);
+    const f4 none = splat<f4>(0.f), v_alpha = in.v_alphas ? load4_first(in.v_alphas + pixel, n) : none;
+    store4(out.r + lane, v.r), store4(out.g + lane, v.g), store4(out.b + lane, v.b);
+    store4(out.depth + lane, in.v_depths ? load4_first(in.v_depths + pixel, n) : none);
+    store4(out.behind + lane, v.r * bg[0] + v.g * bg[1] + v.b * bg[2] - v_alpha);
   });
 }
 
 // The row of splat `i` of a chunk, entry `index` (one-based) of its tile, over the blocks of `mask`.
 template <bool Depth, bool Abs>
 inline void blend_splat_backward(const Local& local, int i, int index, uint32_t mask, BlockGradient* grads, float* row) {
-  const Spread splat_i(local, i);
-  const px r = splat<px>(local.r[i]), g = splat<px>(local.g[i]), b = splat<px>(local.b[i]), depth = splat<px>(local.depth[i]);
-  const px one = splat<px>(1.f), threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
+  const Local::Row& splat_i = local.row[i];
+  const px B = splat<px>(splat_i.B), C = splat<px>(splat_i.C);
+  const px r = splat<px>(splat_i.r), g = splat<px>(splat_i.g), b = splat<px>(local.b[i]), depth = splat<px>(local.depth[i]);
+  const px one = splat<px>(1.f), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
   const pxi here = splat_pxi(index - 1);
+  Alphas alphas;
+  alphas_of<true>(Spread(splat_i), mask, alphas);
   px s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, wr = zero, wg = zero, wb = zero, wz = zero, abs_x = zero, abs_y = zero;
-  for (uint32_t rest = mask; rest; rest &= rest - 1) {
-    const int block = __builtin_ctz(rest);
-    BlockGradient& p = grads[block];
-    const Exponent x = exponent(splat_i, block);
-    const px raw = exp2(x.e), behind = load_px(p.behind);
-    const pxi pass = (x.e >= threshold) & (load_pxi(p.last) > here);
-    const px alpha = keep(pass, min(raw, alpha_max));
-    const px T = load_px(p.T) * (one / (one - alpha)), weight = alpha * T;
+  int n = 0;
+  for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
+    BlockGradient& p = grads[__builtin_ctz(rest)];
+    const px u = alphas.u[n], v = alphas.v[n], alpha = keep(load_pxi(p.last) > here, alphas.alpha[n]), past = one - alpha;
+    const px T = load_px(p.T) * (one / past), weight = alpha * T, behind = load_px(p.behind);
     const px gr = load_px(p.r), gg = load_px(p.g), gb = load_px(p.b);
     px q = r * gr + g * gg + b * gb;
     if (Depth) q = q + depth * load_px(p.depth);
-    const px difference = q - behind;
-    store_px(p.T, T), store_px(p.behind, behind + alpha * difference);
-    const px s = keep(raw < alpha_max, weight * difference);  // a clamped alpha does not move
-    const px u = s * x.u, v = s * x.v;
-    s0 = s0 + s, su = su + u, sv = sv + v, suu = suu + u * x.u, suv = suv + u * x.v, svv = svv + v * x.v;
+    store_px(p.T, T), store_px(p.behind, behind * past + alpha * q);
+    const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
+    const px s_u = s * u, s_v = s * v;
+    s0 = s0 + s, su = su + s_u, sv = sv + s_v, suu = suu + s_u * u, suv = suv + s_u * v, svv = svv + s_v * v;
     wr = wr + weight * gr, wg = wg + weight * gg, wb = wb + weight * gb;
     if (Depth) wz = wz + weight * load_px(p.depth);
-    if (Abs) abs_x = abs_x + abs(u), abs_y = abs_y + abs(splat_i.B * u + splat_i.C * v);
+    if (Abs) abs_x = abs_x + abs(s_u), abs_y = abs_y + abs(B * s_u + C * s_v);
   }
   store8(row, sums(s0, su, sv, suu, suv, svv, wr, wg));
   const float scale = 1.f / kHalfLog2E;
-  store8(row + 8, f8{sum(wb), Depth ? sum(wz) : 0.f, Abs ? sum(abs_x) * local.A[i] * scale : 0.f, Abs ? sum(abs_y) * scale : 0.f, 0.f, 0.f, 0.f, 0.f});
+  store8(row + 8, f8{sum(wb), Depth ? sum(wz) : 0.f, Abs ? sum(abs_x) * splat_i.A * scale : 0.f, Abs ? sum(abs_y) * scale : 0.f, 0.f, 0.f, 0.f, 0.f});
 }
 
 template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& frame, int tile, const BackwardInput& in) {
@@ -78,7 +78,7 @@ template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& fra
   Local local;
   for (int chunk = divide_up(end - begin, kChunk) - 1; chunk >= 0; --chunk) {
     const int first = chunk * kChunk, rest = static_cast<int>(end - begin) - first, n = rest < kChunk ? rest : kChunk;
-    load_chunk(frame, entries + first, n, geometry, local, nullptr);
+    load_chunk(frame, entries + first, n, geometry, local);
     for (int i = n - 1; i >= 0; --i) {
       __builtin_prefetch(row_of(first + (i >= kRowsAhead ? i - kRowsAhead : 0)), 1);
       float* row = row_of(first + i);

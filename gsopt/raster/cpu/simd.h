@@ -38,14 +38,18 @@ inline i8 bits(f8 v) { return (i8)v; }
 inline f8 from_bits(i8 v) { return (f8)v; }
 inline i8 to_int(f8 v) { return __builtin_convertvector(v, i8); }  // truncates
 inline f8 to_float(i8 v) { return __builtin_convertvector(v, f8); }
-inline f8 keep(i8 m, f8 a) { return (f8)(m & (i8)a); }  // a where m, else +0
 inline f8 abs(f8 a) { return (f8)((i8)a & splat8i(0x7fffffff)); }
 
 #if defined(__AVX2__)
 inline int movemask(i8 m) { return _mm256_movemask_ps((__m256)m); }
 inline i8 max(i8 a, i8 b) { return (i8)_mm256_max_epi32((__m256i)a, (__m256i)b); }
+// a where m, else +0; and both of two masks. By name, because the operator & is an integer instruction, for whose result
+// an instruction on floats waits two cycles more.
+inline f8 keep(i8 m, f8 a) { return (f8)_mm256_and_ps((__m256)m, (__m256)a); }
+inline i8 both(i8 m, i8 n) { return (i8)_mm256_and_ps((__m256)m, (__m256)n); }
 inline f8 select(i8 m, f8 a, f8 b) { return (f8)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)m); }
 inline f8 sqrt(f8 a) { return (f8)_mm256_sqrt_ps((__m256)a); }
+inline f8 sqrt_near(f8 a) { return (f8)_mm256_rsqrt_ps((__m256)a) * a; }  // off by 4e-4 at most; NaN at 0
 inline f8 min(f8 a, f8 b) { return (f8)_mm256_min_ps((__m256)a, (__m256)b); }
 inline f8 max(f8 a, f8 b) { return (f8)_mm256_max_ps((__m256)a, (__m256)b); }
 inline i8 shift_left(i8 a, i8 n) { return (i8)_mm256_sllv_epi32((__m256i)a, (__m256i)n); }
@@ -56,12 +60,15 @@ inline int movemask(i8 m) {
   return r;
 }
 inline i8 max(i8 a, i8 b) { return a > b ? a : b; }
+inline f8 keep(i8 m, f8 a) { return (f8)(m & (i8)a); }
+inline i8 both(i8 m, i8 n) { return m & n; }
 inline f8 select(i8 m, f8 a, f8 b) { return m ? a : b; }
 inline f8 sqrt(f8 a) {
   f8 r;
   for (int k = 0; k < 8; ++k) r[k] = __builtin_sqrtf(a[k]);
   return r;
 }
+inline f8 sqrt_near(f8 a) { return sqrt(a); }
 inline f8 min(f8 a, f8 b) { return a < b ? a : b; }
 inline f8 max(f8 a, f8 b) { return a > b ? a : b; }
 inline i8 shift_left(i8 a, i8 n) { return a << n; }
@@ -87,6 +94,7 @@ template <> inline f16 splat<f16>(float x) { return f16{x, x, x, x, x, x, x, x, 
 inline i16 bits(f16 v) { return (i16)v; }
 inline f16 from_bits(i16 v) { return (f16)v; }
 inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
+inline i16 both(i16 m, i16 n) { return m & n; }
 inline f16 min(f16 a, f16 b) { return (f16)_mm512_min_ps((__m512)a, (__m512)b); }
 inline i16 max(i16 a, i16 b) { return (i16)_mm512_max_epi32((__m512i)a, (__m512i)b); }
 inline f16 abs(f16 a) { return (f16)_mm512_abs_ps((__m512)a); }

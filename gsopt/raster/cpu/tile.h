@@ -6,13 +6,17 @@
 
 namespace gsopt::GSOPT_ISA {
 
+constexpr int kRecordsAhead = 16;  // splats of a tile lie anywhere in memory: ask for them early
 constexpr int kBlockRows = kPixels / 4, kStrips = kTile / kBlockRows;
 
-// exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
+// The splats of a chunk as their records begin, x and y from the tile's centre:
+// exponent(X, Y) = log2_opacity - (A (X - x) + B (Y - y))² - (C (Y - y))²
 struct Local {
-  static constexpr int kSize = kChunk;
-  alignas(64) float A[kSize], B[kSize], C[kSize], u0[kSize], v0[kSize], log2_opacity[kSize];
-  alignas(64) float r[kSize], g[kSize], b[kSize], depth[kSize];
+  struct alignas(32) Row {
+    float x, y, A, B, C, log2_opacity, r, g;
+  };
+  Row row[kChunk];
+  float b[kChunk], depth[kChunk];
 };
 
 struct TileGeometry {
@@ -23,46 +27,47 @@ inline TileGeometry tile_geometry(const Frame& frame, int tile) {
           static_cast<float>(tile / frame.tiles_x * kTile + kTile / 2)};
 }
 
-// Per lane the bits of the blocks that the ellipse alpha >= 1/255 touches: bit 4 strip + column. Over a strip of
-// pixel rows the ellipse's right end lies at the strip's y nearest to that of its rightmost point; left mirrors it.
+// Per lane the bits of the blocks with a pixel that the ellipse alpha >= 1/255 reaches: bit 4 strip + column. A row of
+// pixels crosses the ellipse from c - h to c + h, c = dx - B/A y and (A h)² = t - (C y)²; a strip is as wide as its rows
+// together. `sqrt_near` is off by 4e-4 at most, so h is taken 4e-4 too large.
 inline i8 block_masks(f8 A, f8 B, f8 C, f8 lo, f8 dx, f8 dy) {
-  const f8 zero = splat<f8>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f;
-  const f8 iA = splat<f8>(1.f) / A, slope = B * iA;
-  const f8 extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
+  const f8 zero = splat<f8>(0.f), huge = splat<f8>(1e30f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f;
+  const f8 iA = splat<f8>(1.0004f) / A, slope = B / A;
+  const f8 margin = (abs(dx) + abs(slope) * (abs(dy) + 8.f)) * 2e-6f + 0.02f;
   i8 mask = splat8i(0);
   for (int strip = 0; strip < kStrips; ++strip) {
-    const f8 top = splat<f8>(static_cast<float>(kBlockRows * strip) - 7.5f) - dy, bottom = top + (kBlockRows - 1.f);
-    const f8 yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
-    const f8 cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
-    const f8 margin = abs(slope * yr) * 2e-6f + abs(dx) * 2e-6f + 0.02f;
-    const f8 right = dx - slope * yr + sqrt(max(sr, zero)) * iA + margin;
-    const f8 left = dx - slope * yl - sqrt(max(sl, zero)) * iA - margin;
-    // Column k holds the centres 4 k - 7.5 ... 4 k - 4.5: columns [first, behind) are touched.
-    const i8 behind = to_int(clamp((right + 11.5f) * 0.25f, zero, splat<f8>(4.5f)));
-    const i8 first = splat8i(4) - to_int(clamp(splat<f8>(4.f) - (left + 4.5f) * 0.25f, zero, splat<f8>(4.5f)));
-    const i8 one = splat8i(1);
-    const i8 columns = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one);
-    mask |= (columns & ((sr >= 0.f) | (sl >= 0.f))) << (4 * strip);
+    f8 left = huge, right = zero - huge;
+    for (int row = 0; row < kBlockRows; ++row) {
+      const f8 y = splat<f8>(static_cast<float>(kBlockRows * strip + row) - 7.5f) - dy, center = dx - slope * y, v = C * y;
+      const f8 half = sqrt_near(t - v * v) * iA;  // NaN, which leaves both bounds alone, where the row misses the ellipse
+      left = min(center - half, left), right = max(center + half, right);
+    }
+    // Column k holds the centres 4 k - 7.5 ... 4 k - 4.5: those from `first` on and before `behind` are touched.
+    const i8 behind = to_int(clamp((right + margin) * 0.25f + 2.875f, zero, splat<f8>(4.5f)));
+    const i8 first = splat8i(4) - to_int(clamp((margin - left) * 0.25f + 2.875f, zero, splat<f8>(4.5f)));
+    mask |= (shift_left(splat8i(15), first) & ~shift_left(splat8i(255), behind)) << (4 * strip);
   }
-  return mask & (t > 0.f);
+  return mask;
 }
 
-// Loads entries [0, n) of a chunk, eight at a time; with `masks`, also the blocks that each one touches.
-inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeometry tile, Local& local, uint32_t* masks) {
+inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeometry tile, Local& local) {
   const Record* records = frame.records.as<Record>();
+  const f8 origin = {tile.x, tile.y, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};
+  for (int i = 0; i < n; ++i) {
+    __builtin_prefetch(&records[entries[i + kRecordsAhead < n ? i + kRecordsAhead : i].id]);
+    const Record& r = records[entries[i].id];
+    store8(&local.row[i].x, load8(&r.mx) - origin);
+    local.b[i] = r.b, local.depth[i] = r.depth;
+  }
+}
+
+// The blocks that each of n splats touches.
+inline void touched_blocks(const Local& local, int n, uint32_t masks[kChunk]) {
   for (int i = 0; i < n; i += kLanes) {
     f8 v[8];
-    for (int l = 0; l < kLanes; ++l) {
-      const Record& r = records[entries[i + l < n ? i + l : i].id];
-      v[l] = load8(&r.mx);
-      local.b[i + l] = r.b, local.depth[i + l] = r.depth;
-    }
+    for (int l = 0; l < kLanes; ++l) v[l] = load8(&local.row[i + l < n ? i + l : i].x);
     transpose8(v);
-    const f8 dx = v[0] - tile.x, dy = v[1] - tile.y, A = v[2], B = v[3], C = v[4], lo = v[5];
-    store8(local.A + i, A), store8(local.B + i, B), store8(local.C + i, C);
-    store8(local.u0 + i, splat<f8>(0.f) - (A * dx + B * dy)), store8(local.v0 + i, splat<f8>(0.f) - C * dy);
-    store8(local.log2_opacity + i, lo), store8(local.r + i, v[6]), store8(local.g + i, v[7]);
-    if (masks) store8i(reinterpret_cast<int32_t*>(masks) + i, block_masks(A, B, C, lo, dx, dy));
+    store8i(reinterpret_cast<int32_t*>(masks) + i, block_masks(v[2], v[3], v[4], v[5], v[0], v[1]));
   }
 }
 
@@ -81,27 +86,74 @@ inline constexpr BlockPixels kBlockPixels;
 
 // One splat with its numbers spread over the lanes, and its exponent at a block's pixels.
 struct Spread {
-  px A, B, C, u0, v0, log2_opacity;
-  Spread(const Local& l, int i)
-      : A(splat<px>(l.A[i])), B(splat<px>(l.B[i])), C(splat<px>(l.C[i])), u0(splat<px>(l.u0[i])), v0(splat<px>(l.v0[i])), log2_opacity(splat<px>(l.log2_opacity[i])) {}
+  px x, y, A, B, C, log2_opacity;
+  explicit Spread(const Local::Row& r)
+      : x(splat<px>(r.x)), y(splat<px>(r.y)), A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), log2_opacity(splat<px>(r.log2_opacity)) {}
 };
 struct Exponent {
   px u, v, e;
 };
 inline Exponent exponent(const Spread& s, int block) {
-  const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
+  const px dx = load_px(kBlockPixels.x[block]) - s.x, dy = load_px(kBlockPixels.y[block]) - s.y;
   Exponent out;
-  out.u = s.A * X + (s.B * Y + s.u0), out.v = s.C * Y + s.v0;
+  out.u = s.A * dx + s.B * dy, out.v = s.C * dy;
   out.e = s.log2_opacity - out.v * out.v - out.u * out.u;  // v is ready first
   return out;
 }
 
-// Calls visit(pixel of the image, lane) for the lanes of a block that lie inside the image.
-template <class Visit> inline void for_each_pixel(const Frame& frame, int tile, int block, Visit&& visit) {
+// The alphas of one splat at the pixels of the blocks of a mask, one block after the other; 0 where they are not drawn.
+struct Alphas {
+  px alpha[kBlocks], u[kBlocks], v[kBlocks];
+};
+template <bool Moments> inline void alphas_of(const Spread& splat_i, uint32_t mask, Alphas& out) {
+  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
+  int n = 0;
+  for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
+    const Exponent x = exponent(splat_i, __builtin_ctz(rest));
+    out.alpha[n] = keep(x.e >= threshold, min(exp2(x.e), alpha_max));
+    if (Moments) out.u[n] = x.u, out.v[n] = x.v;
+  }
+}
+
+// Calls visit(pixel of the image, lane, n) for the rows of a block, each the n <= 4 of its pixels that lie inside the image.
+template <class Visit> inline void for_each_row(const Frame& frame, int tile, int block, Visit&& visit) {
   const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4), y0 = tile / frame.tiles_x * kTile + kBlockRows * (block / 4);
-  const int w = frame.camera.width, h = frame.camera.height;
-  for (int y = 0; y < kBlockRows && y0 + y < h; ++y)
-    for (int x = 0; x < 4 && x0 + x < w; ++x) visit(static_cast<int64_t>(y0 + y) * w + x0 + x, 4 * y + x);
+  const int w = frame.camera.width, h = frame.camera.height, n = w - x0 < 4 ? w - x0 : 4;
+  for (int row = 0; n > 0 && row < kBlockRows && y0 + row < h; ++row) visit(static_cast<int64_t>(y0 + row) * w + x0, 4 * row, n);
+}
+
+// The first n of four floats, and of four pixels of interleaved RGB; zeros instead of the others.
+inline f4 load4_first(const float* p, int n) {
+  if (n == 4) return load4(p);
+  float v[4] = {};
+  std::memcpy(v, p, sizeof(float) * n);
+  return load4(v);
+}
+inline void store4_first(float* p, f4 v, int n) {
+  if (n == 4) return store4(p, v);
+  std::memcpy(p, &v, sizeof(float) * n);
+}
+struct Rgb {
+  f4 r, g, b;
+};
+inline Rgb load_rgb(const float* p, int n) {
+  float v[12] = {};
+  if (n < 4) p = static_cast<const float*>(std::memcpy(v, p, sizeof(float) * 3 * n));
+  const f4 low = load4(p), mid = load4(p + 4), high = load4(p + 8);
+  return {__builtin_shufflevector(__builtin_shufflevector(low, mid, 0, 3, 6, 6), high, 0, 1, 2, 5),
+          __builtin_shufflevector(__builtin_shufflevector(low, mid, 1, 4, 7, 7), high, 0, 1, 2, 6),
+          __builtin_shufflevector(__builtin_shufflevector(low, mid, 2, 5, 5, 5), high, 0, 1, 4, 7)};
+}
+inline void store_rgb(float* p, const Rgb& c, int n) {
+  const f4 low = __builtin_shufflevector(c.r, c.g, 0, 4, 1, 5), high = __builtin_shufflevector(c.r, c.g, 2, 6, 3, 7);
+  const f4 v[3] = {__builtin_shufflevector(low, c.b, 0, 1, 4, 2),
+                   __builtin_shufflevector(__builtin_shufflevector(low, c.b, 3, 5, 5, 5), high, 0, 1, 4, 5),
+                   __builtin_shufflevector(high, c.b, 6, 2, 3, 7)};
+  if (n < 4) {
+    std::memcpy(p, v, sizeof(float) * 3 * n);
+  } else {
+    for (int k = 0; k < 3; ++k) store4(p + 4 * k, v[k]);
+  }
 }
 
 }  // namespace gsopt::GSOPT_ISA
