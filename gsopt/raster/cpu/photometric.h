@@ -3,7 +3,8 @@
 // SSIM needs five filtered images; only the sum of the two variances enters, so four do: x, y, x² + y², x y. The
 // 11-tap window is separable: first down the columns, two rows of output at a time, so that each input is loaded once
 // for both and the squares and products need no image of their own; then along the rows of interleaved RGB, where
-// neighbors are three floats apart. Sums go row by row in double: the same bits for any number of threads.
+// neighbors are three floats apart. Each row of a strip has its own sum, and these are added in double in one order: the
+// same bits for any number of threads.
 #pragma once
 #include "frame.h"
 #include "parallel.h"
@@ -34,35 +35,55 @@ struct Band {
 };
 
 // Two rows of `Maps` images filtered down the columns, for a strip and kHalo floats on either side; zeros outside.
-template <int Maps> struct Columns {
-  static constexpr int kPad = kHalo + 1, kStride = kStrip + 2 * kPad + 8;
-  alignas(64) float data[2][Maps][kStride];
+template <int Maps> class Columns {
+ public:
+  explicit Columns(const Band& band) : b(band), first(b.x0 < kHalo ? 0 : b.x0 - kHalo), end(b.x0 + b.n + kHalo > b.width ? b.width : b.x0 + b.n + kHalo) {}
 
-  // `load(row, i, values)` puts the inputs of the maps at float i of a row into values[Maps].
-  template <class Load> void fill(const Band& b, int y, Load&& load) {
-    std::memset(data, 0, sizeof(data));
-    const int first = b.x0 - kHalo < 0 ? 0 : b.x0 - kHalo, end = b.x0 + b.n + kHalo > b.width ? b.width : b.x0 + b.n + kHalo;
-    const int k0 = y < kRadius ? kRadius - y : 0, k1 = y + kRadius + 1 < b.height ? kTaps + 1 : b.height - y + kRadius;
-    for (int i = first; i < end; i += 8) {
-      const int at = i + 8 <= end ? i : (end - 8 > first ? end - 8 : first);  // the last vector overlaps its neighbor
+  // `combine(inputs, values)` makes the inputs of the maps from those of the images.
+  template <int Images, class Combine> void fill(int y, const float* const (&images)[Images], Combine&& combine) {
+    const int n = end - first < kLanes ? kLanes : end - first;
+    const float* rows[Images][kTaps + 1];
+    for (int m = 0; m < Images; ++m)
+      for (int k = 0; k <= kTaps; ++k) rows[m][k] = row_of(images[m], y - kRadius + k, narrow[m][k]);
+    for (int i = 0; i < n; i += kLanes) {
+      const int at = i + kLanes <= n ? i : n - kLanes;  // the last vector overlaps its neighbor
       f8 sum[2][Maps] = {};
-      for (int k = k0; k < k1; ++k) {
-        f8 value[Maps];
-        load(y - kRadius + k, at, end - at, value);
+#pragma GCC unroll 12
+      for (int k = 0; k <= kTaps; ++k) {
+        f8 input[Images], value[Maps];
+        for (int m = 0; m < Images; ++m) input[m] = load8(rows[m][k] + at);
+        combine(input, value);
         for (int m = 0; m < Maps; ++m) sum[0][m] += value[m] * kPairWindow.at[k][0], sum[1][m] += value[m] * kPairWindow.at[k][1];
       }
       for (int r = 0; r < 2; ++r)
-        for (int m = 0; m < Maps; ++m) store8(&data[r][m][at - b.x0 + kPad], sum[r][m]);
+        for (int m = 0; m < Maps; ++m) store8(&data[r][m][first + at - b.x0 + kPad], sum[r][m]);
     }
   }
 
-  // Along the row, at float i of the strip.
+  // Along one of the two rows, at float i of the strip.
   f8 filter(int row, int map, int i) const {
     const float* center = &data[row][map][kPad + i];
     f8 sum = load8(center) * kWindow[0];
     for (int k = 1; k <= kRadius; ++k) sum += (load8(center - 3 * k) + load8(center + 3 * k)) * kWindow[k];
     return sum;
   }
+
+ private:
+  static constexpr int kPad = kHalo + 1, kStride = kStrip + 2 * kPad + 8;
+  static constexpr float kNothing[kStride] = {};
+
+  // A row of an image from `first` on: zeros above and below it, a copy that fills a vector where it is too narrow for one.
+  const float* row_of(const float* image, int y, float copy[kLanes]) const {
+    if (y < 0 || y >= b.height) return kNothing;
+    const float* row = image + static_cast<int64_t>(y) * b.width + first;
+    if (end - first >= kLanes) return row;
+    return static_cast<const float*>(std::memcpy(copy, row, sizeof(float) * (end - first)));
+  }
+
+  const Band b;
+  const int first, end;  // the floats of a row that the strip needs
+  alignas(64) float data[2][Maps][kStride] = {};
+  float narrow[3][kTaps + 1][kLanes] = {};
 };
 
 // Eight floats, or the first n of them and zeros.
@@ -88,66 +109,61 @@ inline f8 ssim_partials(f8 mx, f8 my, f8 square, f8 product, f8& d_mean, f8& d_s
   return ssim;
 }
 
-// A running sum in double.
-struct Sum {
-  using d4 = double __attribute__((vector_size(32)));
-  d4 low = {}, high = {};
-  // Adds the first n of eight floats.
-  void add(f8 v, int n) {
-    for (int l = n; l < 8; ++l) v[l] = 0.f;
-    low += __builtin_convertvector(__builtin_shufflevector(v, v, 0, 1, 2, 3), d4);
-    high += __builtin_convertvector(__builtin_shufflevector(v, v, 4, 5, 6, 7), d4);
-  }
-  double total() const { return ((low[0] + low[1]) + (low[2] + low[3])) + ((high[0] + high[1]) + (high[2] + high[3])); }
-};
+// The first n of eight floats, zeros instead of the others.
+inline f8 first_of(f8 v, int n) {
+  for (int l = n; l < kLanes; ++l) v[l] = 0.f;
+  return v;
+}
+
+inline double total(f8 v) {
+  double sum = 0;
+  for (int l = 0; l < kLanes; ++l) sum += static_cast<double>(v[l]);
+  return sum;
+}
 
 // Pass 1: SSIM and its partials (three maps of the image's size), over a band.
-inline void ssim_band(const PhotometricArguments& a, const Band& b, float* const maps[3], double* row_ssim) {
-  Columns<4> columns;
+inline void ssim_band(const PhotometricArguments& a, Band b, float* const maps[3], double* row_ssim) {
+  Columns<4> columns(b);
   for (int y = b.y0; y < b.y1; y += 2) {
-    columns.fill(b, y, [&](int row, int i, int n, f8* value) {
-      const int64_t at = static_cast<int64_t>(row) * b.width + i;
-      const f8 vx = load_first(a.rendered + at, n), vy = load_first(a.target + at, n);
-      value[0] = vx, value[1] = vy, value[2] = vx * vx + vy * vy, value[3] = vx * vy;
+    columns.fill(y, {a.rendered, a.target}, [](const f8* in, f8* value) {
+      const f8 x = in[0], target = in[1];
+      value[0] = x, value[1] = target, value[2] = x * x + target * target, value[3] = x * target;
     });
     for (int r = 0; r < 2 && y + r < b.y1; ++r) {
       const int64_t at = static_cast<int64_t>(y + r) * b.width + b.x0;
       float *mean = maps[0] + at, *square = maps[1] + at, *product = maps[2] + at;
-      Sum sum;
-      for (int i = 0; i < b.n; i += 8) {
+      f8 sum = splat<f8>(0.f);
+      for (int i = 0; i < b.n; i += kLanes) {
         f8 d[3];
         const f8 ssim = ssim_partials(columns.filter(r, 0, i), columns.filter(r, 1, i), columns.filter(r, 2, i), columns.filter(r, 3, i),
                                       d[0], d[1], d[2]);
-        sum.add(ssim, b.n - i);
+        sum += first_of(ssim, b.n - i);
         store_first(mean + i, d[0], b.n - i), store_first(square + i, d[1], b.n - i), store_first(product + i, d[2], b.n - i);
       }
-      row_ssim[y + r] = sum.total();
+      row_ssim[y + r] = total(sum);
     }
   }
 }
 
 // Pass 2: the window is symmetric, so its transpose is itself: v = F(d_mean) + 2 x F(d_square) + y F(d_product).
-inline void gradient_band(const PhotometricArguments& a, const Band& b, float* const maps[3], double* row_l1) {
-  Columns<3> columns;
+inline void gradient_band(const PhotometricArguments& a, Band b, float* const maps[3], double* row_l1) {
+  Columns<3> columns(b);
   const double count = static_cast<double>(b.width) * b.height;
   const f8 w_l1 = splat<f8>(static_cast<float>((1.0 - a.lambda_dssim) / count)), w_ssim = splat<f8>(static_cast<float>(-a.lambda_dssim / count));
   const f8 zero = splat<f8>(0.f);
   for (int y = b.y0; y < b.y1; y += 2) {
-    columns.fill(b, y, [&](int row, int i, int n, f8* value) {
-      const int64_t at = static_cast<int64_t>(row) * b.width + i;
-      for (int m = 0; m < 3; ++m) value[m] = load_first(maps[m] + at, n);
-    });
+    columns.fill(y, {maps[0], maps[1], maps[2]}, [](const f8* in, f8* value) { for (int m = 0; m < 3; ++m) value[m] = in[m]; });
     for (int r = 0; r < 2 && y + r < b.y1; ++r) {
       const int64_t at = static_cast<int64_t>(y + r) * b.width + b.x0;
-      Sum sum;
-      for (int i = 0; i < b.n; i += 8) {
+      f8 sum = splat<f8>(0.f);
+      for (int i = 0; i < b.n; i += kLanes) {
         const f8 x = load_first(a.rendered + at + i, b.n - i), target = load_first(a.target + at + i, b.n - i), difference = x - target;
-        sum.add(abs(difference), b.n - i);
+        sum += first_of(abs(difference), b.n - i);
         const f8 sign = select(difference > 0.f, w_l1, select(difference < 0.f, zero - w_l1, zero));
         const f8 g = columns.filter(r, 0, i) + x * 2.f * columns.filter(r, 1, i) + target * columns.filter(r, 2, i);
         store_first(a.v_rendered + at + i, sign + w_ssim * g, b.n - i);
       }
-      row_l1[y + r] = sum.total();
+      row_l1[y + r] = total(sum);
     }
   }
 }
