@@ -9,8 +9,7 @@ namespace gsopt::GSOPT_ISA {
 constexpr int kRecordsAhead = 16;  // splats of a tile lie anywhere in memory: ask for them early
 constexpr int kBlockRows = kPixels / 4, kStrips = kTile / kBlockRows;
 
-// The splats of a chunk as their records begin, x and y from the tile's centre:
-// exponent(X, Y) = log2_opacity - (A (X - x) + B (Y - y))² - (C (Y - y))²
+// The splats of a chunk as their records begin, x and y from the tile's centre.
 struct Local {
   struct alignas(32) Row {
     float x, y, A, B, C, log2_opacity, r, g;
@@ -84,19 +83,21 @@ struct alignas(64) BlockPixels {
 };
 inline constexpr BlockPixels kBlockPixels;
 
-// One splat with its numbers spread over the lanes, and its exponent at a block's pixels.
+// One splat with its numbers spread over the lanes, and its exponent at a block's pixels:
+// exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
 struct Spread {
-  px x, y, A, B, C, log2_opacity;
+  px A, B, C, u0, v0, log2_opacity;
   explicit Spread(const Local::Row& r)
-      : x(splat<px>(r.x)), y(splat<px>(r.y)), A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), log2_opacity(splat<px>(r.log2_opacity)) {}
+      : A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), u0(splat<px>(-(r.A * r.x + r.B * r.y))), v0(splat<px>(-r.C * r.y)),
+        log2_opacity(splat<px>(r.log2_opacity)) {}
 };
 struct Exponent {
   px u, v, e;
 };
 inline Exponent exponent(const Spread& s, int block) {
-  const px dx = load_px(kBlockPixels.x[block]) - s.x, dy = load_px(kBlockPixels.y[block]) - s.y;
+  const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
   Exponent out;
-  out.u = s.A * dx + s.B * dy, out.v = s.C * dy;
+  out.u = s.A * X + (s.B * Y + s.u0), out.v = s.C * Y + s.v0;
   out.e = s.log2_opacity - out.v * out.v - out.u * out.u;  // v is ready first
   return out;
 }
