@@ -44,21 +44,25 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
   alphas_of<true>(Spread(splat_i), mask, alphas);
-  px s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, wr = zero, wg = zero, wb = zero, wz = zero, abs_x = zero, abs_y = zero;
+  px wr = zero, wg = zero, wb = zero, wz = zero;
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     BlockGradient& p = grads[__builtin_ctz(rest)];
-    const px u = alphas.u[n], v = alphas.v[n], alpha = keep(load_pxi(p.last) > here, alphas.alpha[n]), past = one - alpha;
+    const px alpha = keep(load_pxi(p.last) > here, alphas.alpha[n]), past = one - alpha;
     const px T = load_px(p.T) * (one / past), weight = alpha * T, behind = load_px(p.behind);
     const px gr = load_px(p.r), gg = load_px(p.g), gb = load_px(p.b);
     px q = r * gr + g * gg + b * gb;
     if (Depth) q = q + depth * load_px(p.depth);
     store_px(p.T, T), store_px(p.behind, behind * past + alpha * q);
-    const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
-    const px s_u = s * u, s_v = s * v;
-    s0 = s0 + s, su = su + s_u, sv = sv + s_v, suu = suu + s_u * u, suv = suv + s_u * v, svv = svv + s_v * v;
+    alphas.alpha[n] = keep(alpha < alpha_max, weight * (q - behind));  // s; a clamped alpha does not move
     wr = wr + weight * gr, wg = wg + weight * gg, wb = wb + weight * gb;
     if (Depth) wz = wz + weight * load_px(p.depth);
+  }
+  // A loop of its own: there are not registers enough for all sums at once.
+  px s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, abs_x = zero, abs_y = zero;
+  for (int k = 0; k < n; ++k) {
+    const px s = alphas.alpha[k], u = alphas.u[k], v = alphas.v[k], s_u = s * u, s_v = s * v;
+    s0 = s0 + s, su = su + s_u, sv = sv + s_v, suu = suu + s_u * u, suv = suv + s_u * v, svv = svv + s_v * v;
     if (Abs) abs_x = abs_x + abs(s_u), abs_y = abs_y + abs(B * s_u + C * s_v);
   }
   store8(row, sums(s0, su, sv, suu, suv, svv, wr, wg));
