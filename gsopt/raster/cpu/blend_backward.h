@@ -20,7 +20,6 @@ struct alignas(64) BlockGradient {
 };
 
 inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile, int block, BlockGradient& out) {
-  std::memset(&out, 0, sizeof(out));
   const int64_t at = (static_cast<int64_t>(tile) * kBlocks + block) * kPixels;
   std::memcpy(out.T, frame.transmittance.as<float>() + at, sizeof(out.T));
   std::memcpy(out.last, frame.last.as<int32_t>() + at, sizeof(out.last));
@@ -76,7 +75,7 @@ template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& fra
   const Entry* entries = frame.entries.as<Entry>() + begin;
   const uint32_t* masks = frame.masks.as<uint32_t>() + begin;
   const TileGeometry geometry = tile_geometry(frame, tile);
-  BlockGradient grads[kBlocks];
+  BlockGradient grads[kBlocks] = {};  // pixels outside the image stay zero
   for (int block = 0; block < kBlocks; ++block) load_gradient(frame, in, tile, block, grads[block]);
   const auto row_of = [&](int k) { return frame.rows.as<float>() + static_cast<int64_t>(entries[k].slot) * kRow; };
   Local local;
