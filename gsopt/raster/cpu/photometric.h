@@ -12,7 +12,7 @@
 
 namespace gsopt::GSOPT_ISA {
 
-constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kStrip = 480, kHalo = 3 * kRadius;
+constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kStrip = 2400, kHalo = 3 * kRadius;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 // exp(-k² / (2 1.5²)), normalised over k = -5..5; index = |k|.
 constexpr float kWindow[kRadius + 1] = {0.26601172f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
@@ -169,7 +169,8 @@ inline void gradient_band(const PhotometricArguments& a, Band b, float* const ma
 }
 
 inline void photometric_stage(Pool& pool, PhotometricArguments& a) {
-  const int width = 3 * a.width, strips = divide_up(width, kStrip), bands = pool.threads() == 1 ? 1 : 2 * pool.threads();
+  const int width = 3 * a.width, strip = divide_up(divide_up(width, divide_up(width, kStrip)), kLanes) * kLanes, strips = divide_up(width, strip);
+  const int bands = pool.threads() == 1 ? 1 : 2 * pool.threads();
   const int rows = (a.height + 2 * bands - 1) / (2 * bands) * 2;  // even, so that no pair of rows is split
   const int64_t size = static_cast<int64_t>(width) * a.height, padded = (size + 15) / 16 * 16;
   a.scratch->reserve(sizeof(float) * 3 * padded + sizeof(double) * 2 * strips * a.height);
@@ -177,8 +178,8 @@ inline void photometric_stage(Pool& pool, PhotometricArguments& a) {
   for (int m = 0; m < 3; ++m) maps[m] = a.scratch->as<float>() + m * padded;
   double* sums = reinterpret_cast<double*>(a.scratch->as<float>() + 3 * padded);
   const auto band = [&](int item) -> Band {
-    const int strip = item % strips, x0 = strip * kStrip, y0 = item / strips * rows;
-    return {y0 < a.height ? y0 : a.height, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < kStrip ? width - x0 : kStrip, width, a.height};
+    const int x0 = item % strips * strip, y0 = item / strips * rows;
+    return {y0 < a.height ? y0 : a.height, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < strip ? width - x0 : strip, width, a.height};
   };
   double *ssim = sums, *l1 = sums + static_cast<int64_t>(strips) * a.height;
   parallel(pool, bands * strips, [&](int item, int) { ssim_band(a, band(item), maps, ssim + static_cast<int64_t>(item % strips) * a.height); });
