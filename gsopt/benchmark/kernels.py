@@ -21,7 +21,7 @@ from gsopt.benchmark.surface import surface_scene
 from gsopt.cameras import Cameras
 from gsopt.config import OptimizerConfig
 from gsopt.errors import UsageError
-from gsopt.raster.backend import RasterSettings
+from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.raster.cpu_backend import CpuBackend
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 
@@ -79,13 +79,15 @@ class Iteration:
         # Rates so small that the scene is the same for the first and for the last repetition.
         self.rates = {name: 1e-7 * rate for name, rate in learning_rates(self.config, 1e-4).items()}
         self.target = blurred_noise(self.camera)
+        self.spent: Gradients | None = None
+        """Of the last iteration, written over by the next one, as the trainer does."""
 
     def run(self) -> None:
         """One full iteration."""
         frame = self.backend.forward(self.model.gaussians, self.camera, self.settings)
         loss = self.backend.photometric(frame.colors, self.target, LAMBDA_DSSIM)
-        gradients = self.backend.backward(frame, loss.v_colors)
-        adam_step(self.model, gradients, self.rates, self.config, self.backend, sh_degree=3)
+        self.spent = self.backend.backward(frame, loss.v_colors, into=self.spent)
+        adam_step(self.model, self.spent, self.rates, self.config, self.backend, sh_degree=3)
 
     def render(self) -> None:
         """The picture alone."""
