@@ -1,5 +1,6 @@
-// Stage 3: front-to-back compositing. Splat by splat, block by block: the splats of a tile change few of its blocks, and
-// blocks do not wait for each other, so the processor works on several at once.
+// Stage 3: front-to-back compositing. Splat by splat, and for each twice over the blocks that it touches: its alphas, then
+// what they do to the pixels. Blocks do not wait for each other, so the processor works on several at once; but it looks
+// only some hundred instructions ahead, and in one long loop it would find too few blocks there.
 #pragma once
 #include "parallel.h"
 #include "tile.h"
