@@ -27,6 +27,7 @@ from gsopt._optional import require
 from gsopt.errors import InputError, UsageError
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.sds.clip import ClipEncoder, load_joint_clip
+from gsopt.sds.diffusers_prior import find_part
 from gsopt.sds.noise import Latents, NoiseSchedule
 from gsopt.sds.prior import Condition, Encoder, Images
 from gsopt.sds.warp import warp
@@ -94,6 +95,7 @@ class ViewPrior:
                 f"Try {max(1, self.size // side_multiple()) * side_multiple()}."
             )
         self.schedule = cosine_schedule()
+        self._clip = config.clip
 
     @cached_property
     def unet(self) -> Any:
@@ -130,12 +132,14 @@ class ViewPrior:
         return predict(self.unet, x_t, t, planes, Said.by(conditions))
 
     def encoder(self) -> Encoder | None:
-        """None where the network was not taught words."""
+        """None where the network was not taught words. A CLIP of some hundred captions does not judge whether a prompt
+        fits a picture; the one that --guidance.clip names does."""
         folder = self.folder / CLIP
         if not folder.is_dir():
             return None
-        clip = load_joint_clip(folder, torch.float32)
-        return ClipEncoder(f"{self.folder.name}/{CLIP}", clip.text, clip.image, clip)
+        own = load_joint_clip(folder, torch.float32)
+        judge = load_joint_clip(find_part(self._clip), torch.float32) if self._clip else None
+        return ClipEncoder(f"{self.folder.name}/{CLIP}", own.text, own.image, judge)
 
 
 def predict(

@@ -80,6 +80,10 @@ def test_a_prior_with_captions_takes_words_and_one_without_does_not(prior: Path,
     assert encoder is not None
     assert encoder.unknown_words("a red femur") == ["femur"]
     assert encoder.texts(["", "a red cup"]).shape == (2, encoder.longest, TOKEN_WIDTH)
+    assert encoder.alignment(["a red cup"], torch.rand(1, 3, 8, 8)) is None
+    judged = open_prior(str(prior), GuidanceConfig(clip=str(prior / "clip"))).encoder()
+    assert judged is not None
+    assert judged.alignment(["a red cup"], torch.rand(1, 3, 8, 8)) is not None
     card = json.loads((prior / "gsopt_prior.json").read_text())["measured"]
     assert card["words"]["unknown_words"] == 0
     assert "render, references, words" in card["x0"]
