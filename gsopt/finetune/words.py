@@ -41,7 +41,7 @@ def find_encoder(library: Library, course: Course, folder: Path, base: Path | No
             save_clip(model, tokenizer, unfinished)
             unfinished.rename(folder)
     clip = load_joint_clip(folder, torch.float32)
-    return ClipEncoder(CLIP, clip.text, clip.image, clip)
+    return ClipEncoder(CLIP, clip.text, clip.image, clip, whole_words=True)
 
 
 def words_known(encoder: ClipEncoder, library: Library) -> dict[str, Any]:

@@ -24,8 +24,6 @@ LONGEST = 77
 """Tokens of CLIP's text models."""
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Of CLIP's training images (Radford et al. 2021); a preprocessor_config.json may say otherwise."""
-SMALL_VOCABULARY = 8192
-"""Tokens; CLIP's own has 49,408. The priors that `gsopt finetune` makes learn one token per word of their captions."""
 ROWS = 8
 """Texts or images that are encoded at once."""
 
@@ -71,8 +69,17 @@ class ImageTower:
 class ClipEncoder:
     """A prior's own text encoder, its image encoder when it has one, and a whole CLIP for alignment when given."""
 
-    def __init__(self, name: str, text: TextTower, image: ImageTower | None, joint: JointClip | None) -> None:
-        self.name = name
+    def __init__(
+        self,
+        name: str,
+        text: TextTower,
+        image: ImageTower | None,
+        joint: JointClip | None,
+        *,
+        whole_words: bool = False,
+    ) -> None:
+        """`whole_words`: the tokenizer has one token for every word that was met, as `gsopt finetune` makes them."""
+        self.name, self._whole_words = name, whole_words
         self._text, self._image, self._joint = text, image, joint
 
     @property
@@ -83,10 +90,10 @@ class ClipEncoder:
         return len(self._text.tokenizer(text, truncation=False).input_ids)
 
     def unknown_words(self, text: str) -> list[str]:
-        """A small vocabulary is one of whole words: what it spells out it never met."""
-        tokenizer = self._text.tokenizer
-        if len(tokenizer) > SMALL_VOCABULARY:
+        """Those that a tokenizer of whole words spells out; a tokenizer of pieces does not tell."""
+        if not self._whole_words:
             return []
+        tokenizer = self._text.tokenizer
         words = dict.fromkeys(re.findall(r"[^\W\d_]+", text.lower()))
         return [word for word in words if len(tokenizer.tokenize(word)) > 1]
 

@@ -70,7 +70,7 @@ class Encoder(Protocol):
         ...
 
     def unknown_words(self, text: str) -> list[str]:
-        """Words of a text that it never met; none where its vocabulary is that of the web."""
+        """Words of a text that it never met, as far as it can tell."""
         ...
 
     @property

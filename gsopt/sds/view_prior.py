@@ -139,7 +139,7 @@ class ViewPrior:
             return None
         own = load_joint_clip(folder, torch.float32)
         judge = load_joint_clip(find_part(self._clip), torch.float32) if self._clip else None
-        return ClipEncoder(f"{self.folder.name}/{CLIP}", own.text, own.image, judge)
+        return ClipEncoder(f"{self.folder.name}/{CLIP}", own.text, own.image, judge, whole_words=True)
 
 
 def predict(
