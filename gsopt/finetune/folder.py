@@ -27,6 +27,9 @@ def write_folder(
 ) -> None:
     """unet/ in half precision (`unet` too, afterwards), the noise schedule, gsopt_prior.json and the model card."""
     unet.half().save_pretrained(out / "unet", max_shard_size=LARGEST_SHARD, safe_serialization=True)
+    config = read_json(out / "unet" / "config.json")
+    config.pop("_name_or_path", None)  # where the base lay on this machine is nobody's business
+    write_atomic(out / "unet" / "config.json", to_json(config))
     for file in (out / "unet").iterdir():
         file.chmod(READABLE)  # diffusers writes weights that only their owner may read
     write_atomic(out / CARD, to_json({"size": lessons.size, "measured": dict(measured)}))
@@ -69,8 +72,9 @@ def model_card(
         "",
         "A U-Net (`UNet2DConditionModel`) that is shown a render of a reconstruction from few views, its alpha, its",
         "uncertainty and the nearest input views carried over by its depth, and answers with the image that should be",
-        f"there (x0). {_words(measured)} It knows objects like those listed below and nothing else; on photographs of",
-        "rooms or landscapes it is a denoiser at best.",
+        "there (x0). It knows objects like those listed below and nothing else; on photographs of rooms or landscapes",
+        "it is a denoiser at best.",
+        _words(measured),
         "",
         f"- {parameters / 1e6:.1f} million parameters, float16, {lessons.size} px; torch {torch.__version__}",
         f"- started from {started}; {course.steps} steps of {course.batch} images, seed {course.seed}",

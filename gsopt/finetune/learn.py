@@ -80,7 +80,8 @@ class Training:
         try:
             with safe_open(path, framework="pt") as file:
                 meta = json.loads((file.metadata() or {})["gsopt"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+                # Cloned: in the file they begin anywhere, and products of matrices round differently there.
+                tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
             if meta["course"] != asdict(self.course):
                 raise ValueError(f"it belongs to a course with {meta['course']}")
             self.unet.load_state_dict(_part(tensors, "unet."))
