@@ -19,7 +19,7 @@ from torch import Tensor
 from gsopt._optional import require
 from gsopt.errors import InputError, UsageError
 from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds import clip
+from gsopt.sds import clip, lora
 from gsopt.sds.folder import DiffusersFolder, check_weights
 from gsopt.sds.noise import PREDICTIONS, Latents, NoiseSchedule, Prediction, x0_from
 from gsopt.sds.prior import Condition, Encoder, Images
@@ -39,7 +39,8 @@ class DiffusersPrior:
         self.device = choose_device(config.device)
         self.dtype = choose_dtype(config.dtype, self.device, folder.unet_bytes)
         self.prediction, self.schedule = read_schedule(folder)
-        self.name = f"{folder.name} ({self.prediction}, {str(self.dtype)[6:]} on {self.device})"
+        learned = " with LoRA" if folder.adapter else ""
+        self.name = f"{folder.name}{learned} ({self.prediction}, {str(self.dtype)[6:]} on {self.device})"
         self.size = config.size or _side(folder)
         self.class_embedding_width = _class_width(folder)
         self._tiny_vae, self._clip = config.tiny_vae, config.clip
@@ -52,9 +53,12 @@ class DiffusersPrior:
 
     @cached_property
     def unet(self) -> Any:
-        """The denoiser, frozen."""
+        """The denoiser, frozen, with what was learned beside it."""
         diffusers = require("diffusers", "sds", "Guidance by Stable Diffusion")
-        return self._placed(_loaded(diffusers.UNet2DConditionModel, self.folder.path / "unet", self.dtype))
+        unet = _loaded(diffusers.UNet2DConditionModel, self.folder.path / "unet", self.dtype)
+        if self.folder.adapter is not None:
+            lora.merge(unet, self.folder.adapter)
+        return self._placed(unet)
 
     @cached_property
     def vae(self) -> Any:
