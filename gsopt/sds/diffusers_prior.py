@@ -8,11 +8,12 @@ block's activations instead of all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.utils.checkpoint
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -73,7 +74,7 @@ class DiffusersPrior:
                 f"{self.folder.unet['in_channels']}. Give one that was made for this model."
             )
         if not tiny:
-            vae.enable_gradient_checkpointing()
+            recompute(vae)
         return self._placed(vae)
 
     def encode(self, images: Images) -> Latents:
@@ -128,6 +129,13 @@ class DiffusersPrior:
 
     def _placed(self, network: Any) -> Any:
         return network.to(self.device).eval().requires_grad_(False)
+
+
+def recompute(vae: Any) -> None:
+    """Let the autoencoder's encoder recompute its blocks in the backward pass instead of keeping what they made. There is
+    no chance in them, so no state of a random generator is kept."""
+    checkpoint = torch.utils.checkpoint.checkpoint
+    vae.enable_gradient_checkpointing(partial(checkpoint, use_reentrant=False, preserve_rng_state=False))
 
 
 def padded_tokens(

@@ -139,8 +139,7 @@ def prepared(
         rgb = jittered(rgb, how.jitter, random)
     square = _cut(rgb * alpha + (1 - alpha), how.crop if variant else 0.0, random)
     square = torch.nn.functional.interpolate(square[None], (size, size), mode="bilinear", antialias=True).clamp(0, 1)
-    mirrored = variant and how.flip and bool(torch.rand(1, generator=random) < 0.5)
-    return square.flip(3) if mirrored else square
+    return square.flip(3) if how.flip and variant % 2 else square
 
 
 def stretched(rgb: Float[Tensor, "3 H W"], alpha: Float[Tensor, "1 H W"], percent: float) -> Float[Tensor, "3 H W"]:

@@ -9,6 +9,8 @@ from gsopt import check
 from gsopt.errors import UsageError
 
 LORA_RATE, FULL_RATE = 1e-4, 5e-6
+MANY = 1024
+"""More variants of an image than anybody needs."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Preparation:
     size: int = 0
     """Side of the squares that are cut from them, px; 0 = what the model was made for."""
     flip: bool = False
-    """Half of the variants are mirrored. Not for things that have a left and a right."""
+    """Every other variant is mirrored. Not for things that have a left and a right."""
     crop: float = 0.0
     """Variants are cut at random, up to this share of the side smaller than the middle square, 0 to 0.9."""
     jitter: float = 0.0
@@ -72,7 +74,7 @@ class Preparation:
     """Contrast of every image is stretched so that this percentage of its pixels is clipped at either end: for X-rays
     and the like, 0.5 to 2. Renders of a scene are not stretched: stretch its images, too, or leave this at 0."""
     variants: int = 8
-    """Of every image, the untouched one among them; 1 where nothing above makes them differ."""
+    """Of every image, the untouched one among them; fewer where nothing above makes them differ."""
 
     def __post_init__(self) -> None:
         if self.size:
@@ -80,9 +82,9 @@ class Preparation:
         check.within("--crop", self.crop, 0.0, 0.9, "0 cuts out the middle square; 0.2 is a start.")
         check.within("--jitter", self.jitter, 0.0, 0.5, "0 leaves colors alone; 0.1 is a start.")
         check.within("--stretch", self.stretch, 0.0, 25.0, "It is a percentage; 0 leaves the contrast alone.")
-        check.within("--variants", self.variants, 1, 1024, "8 is usual.")
+        check.within("--variants", self.variants, 1, MANY, "8 is usual.")
 
     @property
     def count(self) -> int:
         """Variants that differ."""
-        return self.variants if self.flip or self.crop or self.jitter else 1
+        return min(self.variants, MANY if self.crop or self.jitter else 2 if self.flip else 1)

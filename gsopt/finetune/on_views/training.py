@@ -50,18 +50,6 @@ class Training:
         self.trained: dict[str, Tensor] = {n: p for n, p in self.unet.named_parameters() if p.requires_grad}
         self.optimizer = torch.optim.AdamW(self.trained.values(), lr=study.rate, weight_decay=0.01)
 
-    def loss(self, lesson: Lesson) -> Float[Tensor, ""]:
-        """Equation (1)."""
-        prior = self.prior
-        z, eps = lesson.z.to(prior.device), lesson.eps.to(prior.device)
-        signal = prior.schedule.signal(lesson.t, z)
-        output = self.unet(
-            add_noise(z, eps, signal).to(prior.dtype),
-            lesson.t.to(prior.device),
-            encoder_hidden_states=None if lesson.tokens is None else lesson.tokens.to(prior.device, prior.dtype),
-        ).sample
-        return (output.float() - output_for(z, eps, signal, prior.prediction)).square().mean()
-
     def advance(self) -> float:
         """One step; its loss. NumericalError when that is not finite: the last saved state is the good one."""
         study = self.study
@@ -70,7 +58,7 @@ class Training:
         self.optimizer.zero_grad(set_to_none=True)
         total = 0.0
         for row in range(study.batch):
-            found = self.loss(self.lessons.draw(study.seed, self.step, row, len(self.prior.schedule)))
+            found = loss(self.prior, self.lessons.draw(study.seed, self.step, row, len(self.prior.schedule)))
             if not bool(torch.isfinite(found)):
                 raise NumericalError(
                     f"The loss of step {self.step} is {float(found)}. Lower --lr, or use --dtype float32, and give "
@@ -96,7 +84,7 @@ class Training:
         """Mean loss of lessons that never change, over some pictures and noise steps."""
         times = [self.prior.schedule.step(share) for share in EXAM_TIMES]
         pictures = range(min(EXAM_PICTURES, len(self.lessons.latents)))
-        found = [float(self.loss(self.lessons.fixed(picture, t))) for picture in pictures for t in times]
+        found = [float(loss(self.prior, self.lessons.fixed(picture, t))) for picture in pictures for t in times]
         return sum(found) / len(found)
 
     def save(self, path: Path) -> None:
@@ -140,3 +128,15 @@ class Training:
                 records.setdefault(int(index), {})[key[0]] = value
         state = self.optimizer.state_dict()
         self.optimizer.load_state_dict({**state, "state": records})
+
+
+def loss(prior: DiffusersPrior, lesson: Lesson) -> Float[Tensor, ""]:
+    """Equation (1)."""
+    z, eps = lesson.z.to(prior.device), lesson.eps.to(prior.device)
+    signal = prior.schedule.signal(lesson.t, z)
+    output = prior.unet(
+        add_noise(z, eps, signal).to(prior.dtype),
+        lesson.t.to(prior.device),
+        encoder_hidden_states=None if lesson.tokens is None else lesson.tokens.to(prior.device, prior.dtype),
+    ).sample
+    return (output.float() - output_for(z, eps, signal, prior.prediction)).square().mean()

@@ -1,0 +1,85 @@
+"""Stable Diffusion 2.1 at its real size: what a guided step needs, counted per tensor; and one that is really made.
+
+The count computes nothing and always runs. The step takes 2.6 GB of disk, 5 GB of memory and minutes: opt-in,
+`make test-sd21`, or GSOPT_SD21=full.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("diffusers", reason="needs the extra gsopt[sds]")
+import real_memory
+import real_sd21
+from real_memory import Account
+
+FULL = os.environ.get("GSOPT_SD21") == "full"
+GPU = 6e9
+"""Bytes of the smallest GPU that is to do."""
+CONTEXT = 0.8e9
+"""Of them taken by CUDA itself and by the workspaces of its convolutions."""
+
+
+@cache
+def account(side: int, **options: bool) -> Account:
+    """In float16, with the halves of classifier-free guidance one after the other unless said otherwise."""
+    return real_memory.account(side, **{"sequential": True, **options})
+
+
+def test_the_architecture_is_the_published_one() -> None:
+    for name, model in real_sd21.models("meta").items():
+        assert sum(p.numel() for p in model.parameters()) == real_sd21.PARAMETERS[name]
+    weights = account(512).weights
+    assert weights == {name: 2 * real_sd21.PARAMETERS[name] for name in ("unet", "vae")}
+
+
+@pytest.mark.parametrize("side", [512, 768])
+def test_a_step_fits_a_gpu_of_6_gb(side: int) -> None:
+    assert account(side).total < GPU - CONTEXT
+
+
+def test_halves_one_after_the_other_need_half_the_activations() -> None:
+    together, apart = (account(512, sequential=s).phases["denoise"].peak for s in (False, True))
+    assert 1.8 < together / apart < 2.2
+
+
+def test_the_encoder_keeps_little_for_its_backward_pass() -> None:
+    """Recomputed blocks: a fifth is kept, and the whole step needs less than half beside its weights."""
+    kept, all_of_it = (account(512, checkpointed=c).phases for c in (True, False))
+    assert kept["encode"].kept < 0.2 * all_of_it["encode"].kept
+    assert kept["step"].peak < 0.5 * all_of_it["step"].peak
+
+
+def test_a_tiny_autoencoder_needs_less_still() -> None:
+    assert account(512, tiny=True).phases["backward"].peak < account(512).phases["backward"].peak
+
+
+@pytest.mark.skipif(not FULL, reason="opt-in: make test-sd21")
+def test_one_guided_step_of_gsopt_train(tmp_path: Path) -> None:
+    """Random weights in bfloat16, 512 px, on the CPU: a gradient that is finite, within what was counted."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
+    from real_step import guided_step
+    from tiny_scenes import write_dataset
+
+    scene = write_dataset(tmp_path / "scene", train=4, test=1)
+    folder = real_sd21.build(tmp_path / "sd21")
+    step = guided_step(folder, scene, tmp_path / "run", "--guidance.size", "512", "--guidance.sequential")
+    assert step.code == 0
+    (gradients,) = step.gradients
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0"):
+        assert torch.isfinite(getattr(gradients, name)).all()
+    assert float(gradients.sh0.abs().max()) > 0
+    assert step.rows == [1, 1]
+    assert step.text_encoders == 0
+    assert step.weights == account(512).weights  # bfloat16 and float16 are as long
+    counted = real_memory.account(512, torch.bfloat16, sequential=True).phases
+    for phase in step.phases:
+        name = {"grad": "backward"}.get(phase.name, phase.name)
+        assert phase.peak == pytest.approx(counted[name].peak, rel=0.05)
+    assert step.peak_rss < 8e9
