@@ -29,6 +29,10 @@ LARGE = 1 << 30
 """Bytes of U-Net weights on disk from which on a CPU computes in bfloat16."""
 
 
+RESIDUAL = "ResnetBlock2D"
+"""What nearly all memory of an autoencoder's encoder is in."""
+
+
 class DiffusersPrior:
     """See `gsopt.sds.prior.Prior`."""
 
@@ -132,10 +136,15 @@ class DiffusersPrior:
 
 
 def recompute(vae: Any) -> None:
-    """Let the autoencoder's encoder recompute its blocks in the backward pass instead of keeping what they made. There is
-    no chance in them, so no state of a random generator is kept."""
-    checkpoint = torch.utils.checkpoint.checkpoint
-    vae.enable_gradient_checkpointing(partial(checkpoint, use_reentrant=False, preserve_rng_state=False))
+    """Let an autoencoder's encoder recompute every residual block in the backward pass instead of keeping what it made.
+
+    At 512 px and 16 bits this leaves 0.6 GB of 1.7 GB; diffusers' own switch, which takes whole levels, 1.0 GB. There
+    is no chance in the blocks, so no state of a random generator is kept.
+    """
+    again = partial(torch.utils.checkpoint.checkpoint, use_reentrant=False, preserve_rng_state=False)
+    for block in vae.encoder.modules():
+        if type(block).__name__ == RESIDUAL:
+            block.forward = partial(again, block.forward)
 
 
 def padded_tokens(

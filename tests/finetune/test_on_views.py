@@ -19,6 +19,7 @@ from tiny_scenes import write_dataset
 
 from gsopt.cli import main
 from gsopt.finetune.on_views import run as stage
+from gsopt.finetune.on_views import training as training_module
 from gsopt.finetune.on_views.lessons import Lesson, Lessons, make_lessons
 from gsopt.finetune.on_views.pictures import Chosen, find_pictures
 from gsopt.finetune.on_views.settings import Preparation, Study
@@ -147,6 +148,29 @@ def test_training_learns_only_what_it_should(base: Path, lessons: Lessons, full:
     assert all(torch.equal(own[n], p) for n, p in training.unet.named_parameters() if n in own)
     if not full:
         assert all(".lora_" in name and value.dtype == torch.float32 for name, value in training.trained.items())
+
+
+def test_large_models_recompute_their_blocks_to_the_same_change(
+    base: Path, lessons: Lessons, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, found = Study(steps=2, batch=1, rank=2, lr=1e-2), []
+    for bytes_from in (1 << 30, 0):
+        monkeypatch.setattr(training_module, "LARGE", bytes_from)
+        training = Training(opened(base), lessons, study)
+        assert training.unet.is_gradient_checkpointing == (bytes_from == 0)
+        training.advance()
+        found.append(training.trained)
+    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(*(f.values() for f in found), strict=True))
+
+
+def test_half_precision_is_for_what_is_frozen_only(base: Path, lessons: Lessons) -> None:
+    study = Study(steps=2, batch=1, rank=2, dtype="bfloat16")
+    training = Training(stage.open_base(find_folder(str(base)), study, Preparation()), lessons, study)
+    assert {value.dtype for value in training.trained.values()} == {torch.float32}
+    assert {p.dtype for p in training.unet.parameters() if not p.requires_grad} == {torch.bfloat16}
+    before = {name: value.detach().clone() for name, value in training.trained.items()}
+    training.advance()
+    assert any(not torch.equal(value, before[name]) for name, value in training.trained.items())
 
 
 @pytest.mark.parametrize("full", [False, True], ids=["lora", "full"])

@@ -50,14 +50,14 @@ def test_halves_one_after_the_other_need_half_the_activations() -> None:
 
 
 def test_the_encoder_keeps_little_for_its_backward_pass() -> None:
-    """Recomputed blocks: a fifth is kept, and the whole step needs less than half beside its weights."""
+    """Recomputed blocks: a quarter is kept, and the whole step needs less than half beside its weights."""
     kept, all_of_it = (account(512, checkpointed=c).phases for c in (True, False))
-    assert kept["encode"].kept < 0.2 * all_of_it["encode"].kept
-    assert kept["step"].peak < 0.5 * all_of_it["step"].peak
+    assert kept["encode"].kept < 0.25 * all_of_it["encode"].kept
+    assert kept["step"].peak < 0.4 * all_of_it["step"].peak
 
 
 def test_a_tiny_autoencoder_needs_less_still() -> None:
-    assert account(512, tiny=True).phases["backward"].peak < account(512).phases["backward"].peak
+    assert account(512, tiny=True).total < account(512).total
 
 
 @pytest.mark.skipif(not FULL, reason="opt-in: make test-sd21")

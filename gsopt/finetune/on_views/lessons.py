@@ -130,7 +130,8 @@ def _save(lessons: Lessons, path: Path) -> None:
 def _load(path: Path) -> Lessons:
     try:
         with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            # Cloned: in the file they begin at any byte, and matrix products round by where their operands begin.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
         return Lessons(tensors["latents"], tensors.get("tokens"), tensors["said"])
     except (OSError, SafetensorError, KeyError) as error:
         raise InputError(f"Cannot read {path} ({error}). Delete it: it is made again.") from error

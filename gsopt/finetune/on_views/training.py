@@ -107,7 +107,7 @@ class Training:
         try:
             with safe_open(path, framework="pt") as file:
                 meta = json.loads((file.metadata() or {})["gsopt"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+                tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
             if meta["study"] != asdict(self.study):
                 raise ValueError(f"it belongs to a training with {meta['study']}")
             self._take(tensors)
