@@ -258,6 +258,7 @@ def test_flags_that_do_not_fit_the_data_are_refused(scene: Path, photos: Path, c
     assert finetune(scene, "-o", tmp_path / "out", "--views", "9") == 2
     assert finetune(scene, "-o", tmp_path / "out", "--view-ids", "a") == 2
     assert finetune(photos, photos, "-o", tmp_path / "out") == 2
+    assert finetune("-o", tmp_path / "out") == 2
     assert finetune(scene, "-o", tmp_path / "out", "--base", "sd21", "--size", "100000") == 2
     assert not (tmp_path / "out").exists()
 

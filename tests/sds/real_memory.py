@@ -42,12 +42,14 @@ def account(
     checkpointed: bool = True,
     sequential: bool = False,
     tiny: bool = False,
+    unet: dict[str, Any] = real_sd21.UNET,
+    vae: dict[str, Any] = real_sd21.VAE,
 ) -> Account:
     """A step as `gsopt.sds.guidance` makes it: encode, two halves of classifier-free guidance, the encoder backwards;
     then the picture for the report."""
-    prior = _prior(side, dtype)
+    prior = _prior(side, dtype, unet, vae)
     with FakeTensorMode(allow_non_fake_inputs=True), Meter() as meter:
-        _give_networks(prior, dtype, tiny)
+        _give_networks(prior, tiny)
         if checkpointed and not tiny:
             diffusers_prior.recompute(prior.vae)
         images = torch.rand(1, 3, side, side).requires_grad_()
@@ -62,10 +64,11 @@ def account(
 def step(prior: DiffusersPrior, images: torch.Tensor, meter: Meter, sequential: bool) -> None:
     with torch.enable_grad(), meter.phase("encode"):
         z = prior.encode(images)
+    width = prior.folder.unet["cross_attention_dim"]
     look = policies.Look(
         t=500,
         eps=torch.randn(z.shape),
-        pair=Pair(Condition(tokens=torch.rand(77, 1024)), Condition(tokens=torch.rand(77, 1024))),
+        pair=Pair(Condition(tokens=torch.rand(77, width)), Condition(tokens=torch.rand(77, width))),
         scale=Scale(3.0, 0.5, sequential),
     )
     inner = prior.denoise
@@ -83,21 +86,21 @@ def step(prior: DiffusersPrior, images: torch.Tensor, meter: Meter, sequential: 
         torch.autograd.grad(z, images, g)
 
 
-def _give_networks(prior: DiffusersPrior, dtype: torch.dtype, tiny: bool) -> None:
+def _give_networks(prior: DiffusersPrior, tiny: bool) -> None:
     from diffusers import AutoencoderKL, AutoencoderTiny, UNet2DConditionModel
 
     usual = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
+    torch.set_default_dtype(prior.dtype)
     try:
-        vae = AutoencoderTiny() if tiny else AutoencoderKL(**real_sd21.VAE)
-        networks = {"unet": UNet2DConditionModel(**real_sd21.UNET), "vae": vae}
+        vae = AutoencoderTiny() if tiny else AutoencoderKL(**prior.folder.vae)
+        networks = {"unet": UNet2DConditionModel(**prior.folder.unet), "vae": vae}
     finally:
         torch.set_default_dtype(usual)
     prior.__dict__.update({name: network.eval().requires_grad_(False) for name, network in networks.items()})
 
 
-def _prior(side: int, dtype: torch.dtype) -> DiffusersPrior:
-    folder = DiffusersFolder(Path(), "SD 2.1", real_sd21.UNET, {**real_sd21.VAE}, tiny_sd21.SCHEDULER)
+def _prior(side: int, dtype: torch.dtype, unet: dict[str, Any], vae: dict[str, Any]) -> DiffusersPrior:
+    folder = DiffusersFolder(Path(), "SD 2.1", unet, vae, tiny_sd21.SCHEDULER)
     prior = DiffusersPrior(folder, GuidanceConfig(size=side, dtype="float32", device="cpu"))
     prior.dtype = dtype
     return prior

@@ -17,7 +17,9 @@ import torch
 pytest.importorskip("diffusers", reason="needs the extra gsopt[sds]")
 import real_memory
 import real_sd21
+import tiny_sd21
 from real_memory import Account
+from real_step import Step, guided_step
 
 FULL = os.environ.get("GSOPT_SD21") == "full"
 GPU = 6e9
@@ -60,16 +62,16 @@ def test_a_tiny_autoencoder_needs_less_still() -> None:
     assert account(512, tiny=True).total < account(512).total
 
 
-@pytest.mark.skipif(not FULL, reason="opt-in: make test-sd21")
-def test_one_guided_step_of_gsopt_train(tmp_path: Path) -> None:
-    """Random weights in bfloat16, 512 px, on the CPU: a gradient that is finite, within what was counted."""
+def in_the_training_run(folder: Path, tmp_path: Path, *flags: str) -> Step:
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
-    from real_step import guided_step
     from tiny_scenes import write_dataset
 
     scene = write_dataset(tmp_path / "scene", train=4, test=1)
-    folder = real_sd21.build(tmp_path / "sd21")
-    step = guided_step(folder, scene, tmp_path / "run", "--guidance.size", "512", "--guidance.sequential")
+    return guided_step(folder, scene, tmp_path / "run", "--guidance.sequential", "--prompt", "a chair", *flags)
+
+
+def require_as_counted(step: Step, counted: Account) -> None:
+    """A finite gradient, the text encoder gone, one row per call, and every part within what was counted."""
     assert step.code == 0
     (gradients,) = step.gradients
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh0"):
@@ -77,9 +79,26 @@ def test_one_guided_step_of_gsopt_train(tmp_path: Path) -> None:
     assert float(gradients.sh0.abs().max()) > 0
     assert step.rows == [1, 1]
     assert step.text_encoders == 0
-    assert step.weights == account(512).weights  # bfloat16 and float16 are as long
-    counted = real_memory.account(512, torch.bfloat16, sequential=True).phases
+    assert step.weights == counted.weights
+    assert {phase.name for phase in step.phases} == {"encode", "denoise", "grad", "decode"}
     for phase in step.phases:
-        name = {"grad": "backward"}.get(phase.name, phase.name)
-        assert phase.peak == pytest.approx(counted[name].peak, rel=0.05)
+        same = counted.phases[{"grad": "backward"}.get(phase.name, phase.name)]
+        assert phase.peak == pytest.approx(same.peak, rel=0.05)
+
+
+def test_the_count_is_that_of_a_step_that_is_made(sd21: Path, tmp_path: Path) -> None:
+    """On the tiny pipeline, in float32."""
+    counted = real_memory.account(
+        tiny_sd21.SIZE, torch.float32, sequential=True, unet=tiny_sd21.UNET, vae=tiny_sd21.VAE
+    )
+    require_as_counted(in_the_training_run(sd21, tmp_path), counted)
+
+
+@pytest.mark.skipif(not FULL, reason="opt-in: make test-sd21")
+def test_one_guided_step_at_the_real_size(tmp_path: Path) -> None:
+    """Random weights in bfloat16, 512 px, on the CPU."""
+    folder = real_sd21.build(tmp_path / "sd21")
+    step = in_the_training_run(folder, tmp_path, "--guidance.size", "512")
+    require_as_counted(step, real_memory.account(512, torch.bfloat16, sequential=True))
+    print(f"{step.cpu_seconds:.0f} CPU s, peak RSS {step.peak_rss / 1e9:.1f} GB")
     assert step.peak_rss < 8e9

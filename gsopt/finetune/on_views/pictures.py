@@ -67,6 +67,8 @@ def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, say: Say) 
 
     `prompt` is said of all; where it is empty, the scene's caption, or what fits any object.
     """
+    if not roots:
+        raise UsageError("No images were given to learn from. Give a posed scene, a folder of images, or images.")
     found: list[Picture] = []
     for root in roots:
         if root.is_dir() and is_posed(root):
