@@ -19,6 +19,7 @@ from tiny_scenes import write_dataset
 
 from gsopt.cli import main
 from gsopt.finetune.on_views import run as stage
+from gsopt.finetune.on_views import sheet
 from gsopt.finetune.on_views import training as training_module
 from gsopt.finetune.on_views.lessons import Lesson, Lessons, make_lessons
 from gsopt.finetune.on_views.pictures import Chosen, find_pictures
@@ -32,6 +33,12 @@ from gsopt.sds.opening import open_prior
 from gsopt.sds.prior import Condition
 
 STEPS = 6
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_sheets() -> None:
+    """What they show is not what is tested."""
+    sheet.STEPS, sheet.SHOWN = 2, 1
 
 
 @pytest.fixture(scope="module")

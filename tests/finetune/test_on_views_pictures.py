@@ -15,6 +15,7 @@ from PIL import Image
 
 from gsopt.cli import main
 from gsopt.errors import InputError, UsageError
+from gsopt.finetune.on_views import training
 from gsopt.finetune.on_views.pictures import Chosen, find_pictures, jittered, prepared, read_upright, stretched
 from gsopt.finetune.on_views.settings import Preparation, Study
 
@@ -35,6 +36,12 @@ def picture(height: int, width: int, channels: int = 3) -> torch.Tensor:
 
 def silent(line: str) -> None:
     pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_exams() -> None:
+    """How much is learned is not what is tested."""
+    training.EXAM_PICTURES, training.EXAM_TIMES = 1, (0.5,)
 
 
 @pytest.fixture(scope="module")

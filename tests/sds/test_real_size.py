@@ -1,7 +1,7 @@
 """Stable Diffusion 2.1 at its real size: what a guided step needs, counted per tensor; and one that is really made.
 
-The count computes nothing and always runs. The step takes 2.6 GB of disk, 5 GB of memory and minutes: opt-in,
-`make test-sd21`, or GSOPT_SD21=full.
+The count computes nothing, but every variant takes seconds: only the first always runs. The step takes 2.6 GB of disk,
+5 GB of memory and minutes. Opt-in: `make test-sd21`, or GSOPT_SD21=full.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import tiny_sd21
 from real_memory import Account
 from real_step import Step, guided_step
 
-FULL = os.environ.get("GSOPT_SD21") == "full"
+opt_in = pytest.mark.skipif(os.environ.get("GSOPT_SD21") != "full", reason="opt-in: make test-sd21")
 GPU = 6e9
 """Bytes of the smallest GPU that is to do."""
 CONTEXT = 0.8e9
@@ -41,16 +41,18 @@ def test_the_architecture_is_the_published_one() -> None:
     assert weights == {name: 2 * real_sd21.PARAMETERS[name] for name in ("unet", "vae")}
 
 
-@pytest.mark.parametrize("side", [512, 768])
+@pytest.mark.parametrize("side", [512, pytest.param(768, marks=opt_in)])
 def test_a_step_fits_a_gpu_of_6_gb(side: int) -> None:
     assert account(side).total < GPU - CONTEXT
 
 
+@opt_in
 def test_halves_one_after_the_other_need_half_the_activations() -> None:
     together, apart = (account(512, sequential=s).phases["denoise"].peak for s in (False, True))
     assert 1.8 < together / apart < 2.2
 
 
+@opt_in
 def test_the_encoder_keeps_little_for_its_backward_pass() -> None:
     """Recomputed blocks: a quarter is kept, and the whole step needs less than half beside its weights."""
     kept, all_of_it = (account(512, checkpointed=c).phases for c in (True, False))
@@ -58,6 +60,7 @@ def test_the_encoder_keeps_little_for_its_backward_pass() -> None:
     assert kept["step"].peak < 0.4 * all_of_it["step"].peak
 
 
+@opt_in
 def test_a_tiny_autoencoder_needs_less_still() -> None:
     assert account(512, tiny=True).total < account(512).total
 
@@ -94,7 +97,7 @@ def test_the_count_is_that_of_a_step_that_is_made(sd21: Path, tmp_path: Path) ->
     require_as_counted(in_the_training_run(sd21, tmp_path), counted)
 
 
-@pytest.mark.skipif(not FULL, reason="opt-in: make test-sd21")
+@opt_in
 def test_one_guided_step_at_the_real_size(tmp_path: Path) -> None:
     """Random weights in bfloat16, 512 px, on the CPU."""
     folder = real_sd21.build(tmp_path / "sd21")
