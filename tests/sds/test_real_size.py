@@ -25,7 +25,7 @@ opt_in = pytest.mark.skipif(os.environ.get("GSOPT_SD21") != "full", reason="opt-
 GPU = 6e9
 """Bytes of the smallest GPU that is to do."""
 CONTEXT = 0.8e9
-"""Of them taken by CUDA itself and by the workspaces of its convolutions."""
+"""Of them allowed to CUDA itself and to the workspaces of its convolutions: a guess."""
 
 
 @cache
@@ -54,7 +54,7 @@ def test_halves_one_after_the_other_need_half_the_activations() -> None:
 
 @opt_in
 def test_the_encoder_keeps_little_for_its_backward_pass() -> None:
-    """Recomputed blocks: a quarter is kept, and the whole step needs less than half beside its weights."""
+    """Recomputed blocks: a quarter is kept, and the step needs two fifths beside its weights."""
     kept, all_of_it = (account(512, checkpointed=c).phases for c in (True, False))
     assert kept["encode"].kept < 0.25 * all_of_it["encode"].kept
     assert kept["step"].peak < 0.4 * all_of_it["step"].peak
