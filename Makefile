@@ -20,7 +20,7 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize test-llm test-blender test-blender-gui blender-extension
+.PHONY: demo test lint bench stress sanitize test-sd21 test-llm test-blender test-blender-gui blender-extension
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
@@ -51,6 +51,10 @@ sanitize: $(VENV)/.for-test
 	  PYTHONPATH="build/sanitized:$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"; \
 	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
 	$(PY) -S -P -m pytest tests/raster
+
+# A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 5 GB of memory.
+test-sd21: $(VENV)/.for-test
+	OMP_NUM_THREADS=1 GSOPT_SD21=full $(PY) -m pytest tests/sds/test_real_size.py
 
 # A real server of the OpenAI-compatible protocol, with a random model and with a small real one (93 MB); up to an hour.
 # Not the package's own requirements: one of them compiles llama.cpp, and transformers reads its file without.

@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from gsopt.cli.sfm import say
 from gsopt.finetune.course import Course
+
+ON_VIEWS = "--on-views"
+"""Asks for another training, with flags of its own."""
 
 
 def finetune(
@@ -22,6 +25,7 @@ def finetune(
     size: int = 128,
     base: Annotated[str | None, arg(metavar="PRIOR")] = None,
     threads: int = 0,
+    on_views: FlagCreatePairsOff[bool] = False,
 ) -> int:
     """Train a view-conditioned prior on posed scenes with many views each; use it with gsopt train --prior PRIOR.
 
@@ -37,7 +41,9 @@ def finetune(
         size: Side of the renders, px.
         base: Prior to start from: `embedded` or a folder; random weights when not given.
         threads: CPU threads of the reconstructions and of the network; 0 = all.
+        on_views: Train Stable Diffusion on images instead, by LoRA: gsopt finetune --on-views --help tells its flags.
     """
+    assert not on_views, "main() hands it on"
     from gsopt.finetune.run import Lessons, find_scenes, start
 
     train, held = find_scenes(data, val)
@@ -52,4 +58,8 @@ def finetune(
 
 def main(argv: Sequence[str]) -> int:
     """Parse the arguments after `gsopt finetune` and run it; the exit code."""
+    if ON_VIEWS in argv:
+        from gsopt.cli.finetune_on_views import main as on_views
+
+        return on_views([argument for argument in argv if argument != ON_VIEWS])
     return tyro.cli(finetune, args=list(argv), prog="gsopt finetune")

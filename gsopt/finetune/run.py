@@ -147,7 +147,10 @@ def _library(scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Ba
 def _base(folder: Path, told: bool) -> Any:
     """The network to start from; one that was never told anything goes on as it was."""
     if not is_view_prior(folder):
-        raise InputError(f"`--base` {folder} is no view-conditioned prior. Give a folder that `gsopt finetune` wrote.")
+        raise InputError(
+            f"`--base` {folder} is no view-conditioned prior. Give a folder that `gsopt finetune` wrote; "
+            "to train Stable Diffusion on images, add --on-views."
+        )
     unet = ViewPrior(folder, GuidanceConfig()).unet.requires_grad_(True)
     if told and not (folder / CLIP).is_dir():
         make_deaf(unet)

