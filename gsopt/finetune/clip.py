@@ -89,10 +89,11 @@ def train_clip(library: Library, said: Sequence[tuple[str, ...]], steps: int, se
     model = make_clip(tokenizer, seed).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=RATE, weight_decay=DECAY, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps + 1, pct_start=WARM_SHARE)
+    described = [index for index, texts in enumerate(said) if texts]
     mean = 0.0
     for step in range(steps):
         random = generator(seed, step, 0, "clip")
-        chosen = [int(i) for i in torch.randperm(len(said), generator=random)[:SCENES] if said[int(i)]]
+        chosen = [described[int(i)] for i in torch.randperm(len(described), generator=random)[:SCENES]]
         pictures = torch.stack([_picture(library, index, random) for index in chosen])
         texts = [said[index][int(torch.randint(len(said[index]), (1,), generator=random))] for index in chosen]
         found = contrast(model, tokenizer, pictures, texts, [said[index][0] for index in chosen])

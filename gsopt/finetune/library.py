@@ -24,6 +24,7 @@ class Library:
 
     pairs: Pairs
     scenes: tuple[Path, ...]
+    """Each has pairs."""
     scene: Int[Tensor, "M"]
     """Of each pair, an index into `scenes`."""
 
@@ -35,7 +36,8 @@ def collect(
     folder.mkdir(parents=True, exist_ok=True)
     parts: list[Pairs] = []
     owners: list[int] = []
-    for index, scene in enumerate(scenes):
+    fitted: list[Path] = []
+    for scene in scenes:
         for fit in range(fits):
             path = folder / f"{scene.name}_{fit}.safetensors"
             if not is_regular(path):
@@ -46,7 +48,8 @@ def collect(
                     break
                 say(f"fitted {scene.name}, {fit + 1} of {fits}")
             parts.append(Pairs.load(path))
-            owners += [index] * len(parts[-1])
+            fitted += [scene] if scene not in fitted else []
+            owners += [len(fitted) - 1] * len(parts[-1])
     if not parts:
         raise InputError(f"None of the {len(scenes)} scenes could be reconstructed. See the messages above.")
-    return Library(Pairs.cat(parts), tuple(scenes), torch.tensor(owners))
+    return Library(Pairs.cat(parts), tuple(fitted), torch.tensor(owners))

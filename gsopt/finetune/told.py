@@ -72,8 +72,6 @@ def tell(encoder: Encoder, library: Library, said: Sequence[tuple[str, ...]]) ->
 def _embedding(encoder: Encoder, library: Library, scene: int) -> Float[Tensor, "E"]:
     """The mean of some of its pictures' embeddings, on white."""
     rows = torch.nonzero(library.scene == scene)[:, 0]
-    if len(rows) == 0:
-        return torch.zeros_like(_embedding(encoder, library, int(library.scene[0])))
     rows = rows[torch.linspace(0, len(rows) - 1, min(PICTURES, len(rows))).round().long()]
     rgba = library.pairs.truth[rows].float() / 255
     embedded = encoder.images(rgba[:, :3] + 1 - rgba[:, 3:])

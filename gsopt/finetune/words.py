@@ -29,17 +29,17 @@ def said_of_all(library: Library) -> list[tuple[str, ...]]:
 def find_encoder(library: Library, course: Course, folder: Path, base: Path | None, say: Say) -> ClipEncoder | None:
     """The encoder of the words to be taught, kept in `folder`; None where there are none to teach."""
     if not folder.is_dir():
+        unfinished = folder.with_name(f"{folder.name}.part")
         if base is not None and (base / CLIP).is_dir():
-            shutil.copytree(base / CLIP, folder)
+            shutil.copytree(base / CLIP, unfinished, dirs_exist_ok=True)
         else:
             said = said_of_all(library)
             if course.clip_steps == 0 or len({texts[0] for texts in said if texts}) < FEWEST:
                 say("no words: " + ("--clip-steps is 0" if course.clip_steps == 0 else "the scenes have no captions"))
                 return None
             model, tokenizer = train_clip(library, said, course.clip_steps, course.seed, say)
-            unfinished = folder.with_name(f"{folder.name}.part")
             save_clip(model, tokenizer, unfinished)
-            unfinished.rename(folder)
+        unfinished.rename(folder)
     clip = load_joint_clip(folder, torch.float32)
     return ClipEncoder(CLIP, clip.text, clip.image, clip, whole_words=True)
 
@@ -47,17 +47,18 @@ def find_encoder(library: Library, course: Course, folder: Path, base: Path | No
 def words_known(encoder: ClipEncoder, library: Library) -> dict[str, Any]:
     """How well held-out scenes are understood: the share of their captions' words that were never met, and how often a
     picture fits its own caption better than all others, beside the share that guessing gives."""
-    captions = [texts[0] for texts in said_of_all(library) if texts]
+    said = said_of_all(library)
+    captions = [texts[0] for texts in said if texts]
     words = {word for caption in captions for word in caption.split()}
     unknown = {word for caption in captions for word in encoder.unknown_words(caption)}
     different = sorted(set(captions))
     if not different:
         return {}
     right = []
-    for index, texts in enumerate(said_of_all(library)):
-        rows = torch.nonzero(library.scene == index)[:, 0][:SHOWN]
-        if not texts or not len(rows):
+    for index, texts in enumerate(said):
+        if not texts:
             continue
+        rows = torch.nonzero(library.scene == index)[:, 0][:SHOWN]
         rgba = library.pairs.truth[rows].float() / 255
         found = encoder.alignment(different, rgba[:, :3] + 1 - rgba[:, 3:])
         assert found is not None

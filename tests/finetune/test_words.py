@@ -135,6 +135,23 @@ def test_lessons_say_what_belongs_to_their_scene(prior: Path, scenes: Path) -> N
     assert 0 <= words_known(encoder, library)["right_caption"] <= 1
 
 
+def test_scenes_without_captions_and_scenes_that_cannot_be_fitted_are_left_out(scenes: Path, tmp_path: Path) -> None:
+    """Of five scenes one is silent and one broken: the words are those of the others."""
+    for name in (*CAPTIONS, "silent"):
+        write_dataset(tmp_path / "data" / name, train=6, test=2)
+        if name in CAPTIONS:
+            (tmp_path / "data" / name / "captions.json").write_text(json.dumps({"caption": CAPTIONS[name]}))
+    write_dataset(tmp_path / "data" / "broken", train=6, test=2)
+    (tmp_path / "data" / "broken" / "captions.json").write_text(json.dumps({"caption": "a femur"}))
+    for image in (tmp_path / "data" / "broken").rglob("*.png"):
+        image.write_bytes(b"no picture")
+    out = tmp_path / "prior"
+    assert main(command(tmp_path / "data", out)) == 0
+    encoder = open_prior(str(out), GuidanceConfig()).encoder()
+    assert encoder is not None
+    assert encoder.unknown_words("a red cup, a blue table, a femur") == ["femur"]
+
+
 def test_a_run_tells_the_prior_its_prompt(prior: Path, scenes: Path, tmp_path: Path) -> None:
     """Different words, different Gaussians; the same words, the same bits."""
     found = []
