@@ -201,6 +201,8 @@ class SparseConfig:
     """Replaces the weight of LossConfig where this is larger."""
     sh_degree: int = 2
     """Upper bound on the bands."""
+    symmetry: Literal["auto", "off"] = "auto"
+    """Look for the mirror planes of an object with masks, and learn from the mirror images of its photos too."""
     steps_per_view: int = 500
     """A run takes at most this many steps per input view: more learn few views by heart; 0 = no bound."""
 
@@ -211,6 +213,7 @@ class SparseConfig:
         check.within("--sparse.lambda-opacity", self.lambda_opacity, 0.0, MOST, "The default is 0.03.")
         check.within("--sparse.lambda-scale", self.lambda_scale, 0.0, MOST, "The default is 0.01.")
         check.within("--sparse.lambda-alpha", self.lambda_alpha, 0.0, MOST, "The default is 0.5.")
+        check.one_of("--sparse.symmetry", self.symmetry, ("auto", "off"))
         check.within("--sparse.sh-degree", self.sh_degree, 0, 3, "Bands 0 to 3 are supported.")
         check.at_least("--sparse.steps-per-view", self.steps_per_view, 0, "0 sets no bound; the default is 500.")
 

@@ -36,10 +36,15 @@ class View:
     store: ImageStore
     index: int
     """Its row in the store."""
+    mirrored: bool = False
+    """Read from right to left: not a photo but the mirror image of one (gsopt/symmetry)."""
+    color: float = 1.0
+    """Weight of its colors in the loss; at 0 only its silhouette counts."""
 
     def pixels(self) -> UInt8[Tensor, "H W C"]:
         """sRGB-coded pixels, undistorted and downscaled; C = 4 (straight alpha) with alpha or a mask, else 3."""
-        return self.store.get(self.index)
+        stored = self.store.get(self.index)
+        return stored.flip(1) if self.mirrored else stored
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,13 @@ class Scene:
     """What the loader noticed (images absent, images skipped): shown to the user and kept with the run."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from every source position; not zero only where coordinates were too large for float32."""
+    mirrored: tuple[View, ...] = ()
+    """Mirror images of the input views, where the object is symmetric."""
+
+    @property
+    def drawn(self) -> tuple[View, ...]:
+        """What a step may draw: the input views, then their mirror images."""
+        return self.train + self.mirrored
 
     @property
     def extent(self) -> float:

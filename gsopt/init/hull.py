@@ -16,9 +16,11 @@ from torch import Tensor
 
 from gsopt.cameras import Cameras
 from gsopt.data.scene import Scene
-from gsopt.init.photos import Photo, colors_from_sums, sample, small_photos
+from gsopt.init.photos import Photo, sample, small_photos
 from gsopt.init.rig import Focus, find_focus, inside, project
 from gsopt.init.rounded import rounded
+from gsopt.init.surface import unoccluded_colors
+from gsopt.init.voxels import Grid, dilated, eroded
 
 SURFACE_SHARE = 0.7
 """Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and
@@ -38,7 +40,6 @@ _SOLID = 0.5
 _FULL = 0.98
 """Silhouettes that cover more than this of all pixels outline nothing."""
 _ROUNDS = 24
-_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -52,22 +53,9 @@ class HullPoints:
     """Edge of the finest voxels, scene units."""
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Voxels that may belong to the hull."""
-
-    occupied: Bool[Tensor, "X Y Z"]
-    low: Float[Tensor, "3"]
-    """Corner of voxel (0, 0, 0)."""
-    voxel: float
-
-    def centers(self, cells: Bool[Tensor, "X Y Z"]) -> Float[Tensor, "M 3"]:
-        return self.low + (torch.nonzero(cells) + 0.5) * self.voxel
-
-
 def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoints | None:
     """`count` coloured points on and in the hull of the input views; None when the silhouettes enclose nothing."""
-    photos = small_photos(scene.train, MAX_PHOTOS)
+    photos = small_photos(scene.drawn, MAX_PHOTOS)
     covered = sum(float((photo.planes[3] > 127).double().mean()) for photo in photos) / len(photos)
     if covered > _FULL:
         return None
@@ -80,7 +68,8 @@ def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoi
     xyz = _sample_points(grid, photos, count, generator)
     if len(xyz) == 0:
         return None
-    return HullPoints(xyz, unoccluded_colors(grid, photos, xyz), len(photos), grid.voxel)
+    colored = [photo for photo in photos if photo.colored]
+    return HullPoints(xyz, unoccluded_colors(grid, colored, xyz), len(photos), grid.voxel)
 
 
 def carve(photos: list[Photo], focus: Focus) -> Grid | None:
@@ -167,8 +156,8 @@ def _spread(planes: Float[Tensor, "1 H W"], reach: int) -> Float[Tensor, "1 H W"
 
 def _sample_points(grid: Grid, photos: list[Photo], count: int, generator: torch.Generator) -> Float[Tensor, "N 3"]:
     """Points near the surface and points inside, each accepted by `in_hull`."""
-    core = _eroded(grid.occupied)
-    rim = _dilated(grid.occupied) & ~core
+    core = eroded(grid.occupied)
+    rim = dilated(grid.occupied) & ~core
     on_surface = count if not bool(core.any()) else round(SURFACE_SHARE * count)
     surface = _accepted(grid, rim, photos, on_surface, generator)
     inner = _accepted(grid, core, photos, count - len(surface), generator)
@@ -189,61 +178,3 @@ def _accepted(
         points = corners[drawn] + grid.voxel * torch.rand(2 * missing, 3, generator=generator)
         accepted.append(points[in_hull(photos, points)])
     return torch.cat(accepted)[:count]
-
-
-def unoccluded_colors(grid: Grid, photos: list[Photo], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Mean colour over the photos in which a point lies nearest behind the hull's front surface.
-
-    For a point on the surface these are the photos that see it; for one inside, those that see the surface before it.
-    """
-    front = grid.centers(grid.occupied & ~_eroded(grid.occupied))
-    covers = [_front_depths(grid, photo, front) for photo in photos]
-    colors = [_colors_of(grid, photos, covers, chunk) for chunk in points.split(_CHUNK)]
-    return torch.cat(colors)
-
-
-def _colors_of(
-    grid: Grid, photos: list[Photo], covers: list[tuple[Tensor, int]], points: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N 3"]:
-    buried = torch.full((len(photos), len(points)), math.inf)
-    for index, (photo, (cover, step)) in enumerate(zip(photos, covers, strict=True)):
-        column, row, depth = project(photo.camera, points)
-        shown = torch.nonzero(inside(photo.camera, column, row, depth))[:, 0]
-        nearest = cover[_cells(row[shown], step, cover.shape[0]), _cells(column[shown], step, cover.shape[1])]
-        buried[index, shown] = (depth[shown] - nearest).clamp(min=0)
-    # A voxel and a half: the front depths are those of voxel centres.
-    chosen = buried <= buried.amin(dim=0) + 1.5 * grid.voxel
-    total = torch.zeros(4, len(points))
-    for index, photo in enumerate(photos):
-        rows = torch.nonzero(chosen[index] & buried[index].isfinite())[:, 0]
-        column, row, _ = project(photo.camera, points[rows])
-        total[:, rows] += sample(photo.planes.float(), column, row) / 255
-    return colors_from_sums(total)
-
-
-def _front_depths(grid: Grid, photo: Photo, front: Float[Tensor, "M 3"]) -> tuple[Float[Tensor, "h w"], int]:
-    """Smallest depth of the hull per block of `step` pixels (about a voxel large), infinite where there is none."""
-    column, row, depth = project(photo.camera, front)
-    shown = inside(photo.camera, column, row, depth)
-    column, row, depth = column[shown], row[shown], depth[shown]
-    footprint = grid.voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth.median()) if len(depth) else 1.0
-    step = max(1, math.ceil(1.5 * footprint))
-    height, width = math.ceil(photo.camera.height / step), math.ceil(photo.camera.width / step)
-    block = _cells(row, step, height) * width + _cells(column, step, width)
-    cover = torch.full((height * width,), math.inf).scatter_reduce(0, block, depth, "amin")
-    return cover.view(height, width), step
-
-
-def _cells(coordinate: Tensor, step: int, count: int) -> Tensor:
-    return (coordinate / step).long().clamp(0, count - 1)
-
-
-def _dilated(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
-    """With the 26 neighbours of every true voxel."""
-    return torch.nn.functional.max_pool3d(cells[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
-
-
-def _eroded(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
-    """Without the voxels that have one of their 26 neighbours outside, the grid's border included."""
-    padded = torch.nn.functional.pad((~cells)[None, None].float(), (1,) * 6, value=1.0)
-    return torch.nn.functional.max_pool3d(padded, 3, stride=1)[0, 0] == 0

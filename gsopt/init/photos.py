@@ -26,6 +26,8 @@ class Photo:
     camera: Cameras
     planes: UInt8[Tensor, "4 H W"]
     """Colour times alpha, then alpha."""
+    colored: bool = True
+    """Whether its colours are to be believed, and not only its silhouette."""
 
     def alpha(self) -> Float[Tensor, "1 H W"]:
         """0..1."""
@@ -54,7 +56,7 @@ def _small(view: View) -> Photo:
     planes = (area_downscale(planes, width, height) + 0.5).clamp(0, 255).to(torch.uint8)
     if len(planes) == 3:
         planes = torch.cat([planes, torch.full_like(planes[:1], 255)])
-    return Photo(view.camera.resized(width, height), planes)
+    return Photo(view.camera.resized(width, height), planes, colored=view.color > 0)
 
 
 def sample(planes: Float[Tensor, "C H W"], column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "C N"]:

@@ -116,7 +116,7 @@ class Guide:
         self._denoise_steps, self._guidance_scale = self.config.denoise_steps, self.config.guidance_scale
         self.weight, self.iterations, self.seed, self.background = weight, iterations, seed, background
         self.warn = warn
-        self.inputs = [view.camera for view in scene.train]
+        self.inputs = [view.camera for view in scene.drawn]
         self.rig = make_rig(self.inputs, scene.extent, prior.size, front)
         self.references = square_views(scene.train, prior.size, torch.ones(3) if background is None else background)
         self.counts = Counts()

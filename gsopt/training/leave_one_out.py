@@ -113,9 +113,10 @@ def short_config(config: TrainConfig, scene: Scene, view_conditioned: bool) -> T
 
 
 def without(scene: Scene, index: int) -> Left:
-    """The scene without one of its input views; its PSNR is not measured yet."""
+    """The scene without one of its input views and that one's mirror images; its PSNR is not measured yet."""
     others = tuple(view for i, view in enumerate(scene.train) if i != index)
-    return Left(replace(scene, train=others), scene.train[index], 0.0)
+    images = tuple(image for image in scene.mirrored if image.index != scene.train[index].index)
+    return Left(replace(scene, train=others, mirrored=images), scene.train[index], 0.0)
 
 
 def spread_views(scene: Scene, count: int) -> list[int]:

@@ -28,6 +28,8 @@ class Target:
     """None where the image has no alpha and no mask."""
     size: tuple[int, int]
     """Height and width of the whole image, px, of which this may be a window."""
+    color: float = 1.0
+    """Weight of the colors in the loss."""
 
     @property
     def share(self) -> float:
@@ -79,7 +81,9 @@ class Targets:
         colors, alphas = premultiplied(view.pixels(), width, height)
         if self._fixed is not None and alphas is not None:
             colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed)
-        target = Target(view.camera.to(torch.float32).resized(width, height), colors, alphas, (height, width))
+        target = Target(
+            view.camera.to(torch.float32).resized(width, height), colors, alphas, (height, width), view.color
+        )
         if not whole:
             target = cropped(target)
         size = target.colors.nbytes + (0 if target.alphas is None else target.alphas.nbytes)

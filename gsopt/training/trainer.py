@@ -81,13 +81,14 @@ class Trainer:
         self._weights = schedule.weights(config, views)
         self._max_sh_degree = schedule.max_sh_degree(config, views)
         self._generators = generators(config.seed)
-        self._order = ViewOrder(views, self._generators["views"])
-        self._flatness = schedule.Flatness.of(views)
-        self._resting = Resting(views)
+        drawn = len(scene.drawn)
+        self._order = ViewOrder(drawn, self._generators["views"])
+        self._flatness = schedule.Flatness.of(drawn)
+        self._resting = Resting(drawn)
         self._bands = Bands(config.optimizer.sh_degree_every, self._max_sh_degree)
         fixed = BACKGROUNDS.get(config.data.background)
         self._background = None if fixed is None else torch.tensor(fixed)
-        self._targets = Targets(scene.train, self._background, int(TARGET_SHARE * config.data.cache_mb * 1e6))
+        self._targets = Targets(scene.drawn, self._background, int(TARGET_SHARE * config.data.cache_mb * 1e6))
         self._extent = scene.extent
         self._coarse_until = schedule.coarse_until(config, views)
         self._budget = schedule.max_gaussians(config, content_pixels(scene.train))
@@ -125,7 +126,7 @@ class Trainer:
         self._change_set()
         self._resting.note(index, loss)
         self._end_when_flat(loss)
-        return loss, self.scene.train[index].name
+        return loss, self.scene.drawn[index].name
 
     def _rests(self, index: int) -> bool:
         """Whether this step's view has converged and is left out; only once the set of Gaussians is settled, and never
@@ -140,7 +141,7 @@ class Trainer:
         loss = float(self._resting.last[index])
         self._change_set()
         self._end_when_flat(loss)
-        return loss, self.scene.train[index].name
+        return loss, self.scene.drawn[index].name
 
     def settings(self) -> RasterSettings:
         """How the current step draws."""
@@ -163,14 +164,16 @@ class Trainer:
         v_alphas = None
         if self._weights.alpha > 0 and target.alphas is not None:
             v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha * target.share)
-        v_colors = photometric.v_colors if target.share == 1 else photometric.v_colors.mul_(target.share)
+        weight = target.share * target.color
+        v_colors = photometric.v_colors if weight == 1 else photometric.v_colors.mul_(weight)
         gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=self._wants_absgrad(), into=self._spent)
         self._spent = gradients
         self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])
         if self.config.schedule.bands == "residual" and self._bands.watches(self.step):
             self._bands.note(self.model.gaussians, target.camera, gradients)
-        loss = photometric.loss * target.share
-        self._show(loss, frame.colors, target)
+        loss = photometric.loss * weight
+        if target.color == 1:
+            self._show(loss, frame.colors, target)
         return loss, self._regularized(gradients, dropout)
 
     def _wants_absgrad(self) -> bool:

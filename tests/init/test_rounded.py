@@ -9,10 +9,11 @@ import torch
 from shapes import ellipsoid_scene, spread_cameras
 
 from gsopt.data.scene import load_scene
-from gsopt.init.hull import Grid, carve
+from gsopt.init.hull import carve
 from gsopt.init.photos import Photo, small_photos
 from gsopt.init.rig import find_focus
 from gsopt.init.rounded import FAR, RATIO, rounded, squared_distance, thickest, thickness
+from gsopt.init.voxels import Grid
 
 CENTER = (0.3, -0.2, 0.1)
 

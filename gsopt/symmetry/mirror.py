@@ -1,0 +1,43 @@
+"""A mirror plane, and the photo that a camera behind it would take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The plane normal · x = offset."""
+
+    normal: Float[Tensor, "3"]
+    """Of length 1."""
+    offset: float
+    """Scene units."""
+
+    def distance(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
+        """Signed, scene units; written out by coordinate, so that no matrix product's blocking decides the last bit."""
+        x, y, z = self.normal.tolist()
+        return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z - self.offset
+
+    def reflect(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """Where the points appear behind the mirror."""
+        return points - 2 * self.distance(points)[..., None] * self.normal
+
+    def camera(self, camera: Cameras) -> Cameras:
+        """Where one camera stands behind the mirror. What it sees of a symmetric object is its photo, read from right
+        to left: with M the reflection and F = diag(-1, 1, 1), cam_from_world is F V M, again a rigid motion."""
+        n = self.normal.double()
+        reflection = torch.eye(4, dtype=torch.float64)
+        reflection[:3, :3] -= 2 * n[:, None] * n
+        reflection[:3, 3] = 2 * self.offset * n
+        flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.float64))
+        viewmats = (flip @ camera.viewmats.double() @ reflection).to(camera.viewmats)
+        Ks = camera.Ks.clone()
+        Ks[:, 0, 2] = camera.width - Ks[:, 0, 2]
+        return replace(camera, viewmats=viewmats, Ks=Ks)

@@ -1,0 +1,184 @@
+"""Where a mirror plane may be: all directions are tried on coarse voxels, the best are refined on the outlines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from gsopt.init.photos import Photo
+from gsopt.init.rig import inside, project
+from gsopt.init.voxels import Grid, dilated
+from gsopt.symmetry.mirror import Mirror
+from gsopt.symmetry.silhouettes import Silhouettes
+
+DIRECTIONS = 400
+"""Normals tried, spread over the half sphere: about 7 degrees apart."""
+OFFSETS, FARTHEST = 13, 0.2
+"""Planes tried per normal, and how far from the hull's centre, in hull radii."""
+COARSER = 3
+"""Voxels are joined by this many along each axis."""
+UNCOVERED = 0.05
+"""A candidate may leave this share of the silhouettes unexplained: its direction is 3 degrees off."""
+APART = 20.0
+"""Between the normals of two candidates, degrees."""
+MOST = 6
+"""Candidates refined."""
+ITERATIONS, TRIES = 15, 4
+"""Steps of the refinement at most, and dampings tried for each."""
+GAIN, FINE = 0.995, 3e-4
+"""It ends where a step leaves more than this share of the misses, or moves by less: radians, radii."""
+HOPE, HOPELESS = 4, 3.0
+_CHUNK = 32
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Around the hull."""
+
+    center: Float[Tensor, "3"]
+    radius: float
+
+
+def bounding_ball(grid: Grid) -> Ball:
+    cells = grid.centers()
+    center = cells.mean(0)
+    return Ball(center, float((cells - center).norm(dim=1).max()) + grid.voxel)
+
+
+def candidates(grid: Grid, photos: list[Photo], ball: Ball) -> list[Mirror]:
+    """Up to MOST planes, best first: those that leave least of the silhouettes unexplained when the hull is cut with
+    its mirror image."""
+    normals = half_sphere(DIRECTIONS)
+    shifts = torch.linspace(-FARTHEST, FARTHEST, OFFSETS) * ball.radius
+    middle = (normals * ball.center).sum(1)
+    offsets = (middle[:, None] + shifts).flatten()
+    normals = normals.repeat_interleave(OFFSETS, 0)
+    lost = uncovered(joined(grid, COARSER), photos, normals, offsets)
+    found: list[Mirror] = []
+    for row in lost.argsort(stable=True).tolist():
+        if len(found) == MOST or float(lost[row]) > UNCOVERED:
+            break
+        mirror = Mirror(normals[row], float(offsets[row]))
+        if not any(same(mirror, other, APART) for other in found):
+            found.append(mirror)
+    return found
+
+
+def same(a: Mirror, b: Mirror, degrees: float) -> bool:
+    """Whether the normals of two planes are nearer to each other than this."""
+    return abs(float((a.normal * b.normal).sum())) > math.cos(math.radians(degrees))
+
+
+def half_sphere(count: int) -> Float[Tensor, "N 3"]:
+    """Evenly spread directions with z > 0, along a spiral of golden angles."""
+    row = torch.arange(count) + 0.5
+    z, turn = row / count, row * math.pi * (3 - math.sqrt(5))
+    ring = (1 - z**2).sqrt()
+    return torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)
+
+
+def joined(grid: Grid, factor: int) -> Grid:
+    """Coarser voxels, true where any of theirs is."""
+    cells = torch.nn.functional.max_pool3d(grid.occupied[None, None].float(), factor, factor, ceil_mode=True)[0, 0] > 0
+    return Grid(cells, grid.low, grid.voxel * factor)
+
+
+def uncovered(
+    grid: Grid, photos: list[Photo], normals: Float[Tensor, "P 3"], offsets: Float[Tensor, "P"]
+) -> Float[Tensor, "P"]:
+    """For every plane the share of the silhouettes (in pixels a voxel wide, mean over the photos) that no voxel covers
+    whose mirror image also lies in the hull, give or take one voxel."""
+    centers = grid.centers()
+    wide = torch.nn.functional.pad(dilated(grid.occupied), (1,) * 6)
+    pixels = [_pixels(photo, centers, grid.voxel) for photo in photos]
+    lost = []
+    for n, d in zip(normals.split(_CHUNK), offsets.split(_CHUNK), strict=True):
+        stays = _also_behind(wide, grid, centers, n, d)
+        shares = [_uncovered_share(rows, pixel, stays) for rows, pixel in pixels]
+        lost.append(torch.stack(shares).mean(0))
+    return torch.cat(lost)
+
+
+def _also_behind(
+    wide: Bool[Tensor, "X Y Z"], grid: Grid, centers: Float[Tensor, "M 3"], normals: Tensor, offsets: Tensor
+) -> Bool[Tensor, "M P"]:
+    """Whether the mirror image of a voxel's centre lies in `wide`, which is padded by one voxel."""
+    beyond = sum(centers[:, axis, None] * normals[:, axis] for axis in range(3)) - offsets
+    inside_grid = torch.ones_like(beyond, dtype=torch.bool)
+    index = torch.zeros_like(beyond, dtype=torch.int64)
+    for axis, size in enumerate(wide.shape):
+        there = (centers[:, axis, None] - 2 * beyond * normals[:, axis] - grid.low[axis]) / grid.voxel
+        cell = there.floor().long() + 1
+        inside_grid &= (cell >= 0) & (cell < size)
+        index = index * size + cell.clamp(0, size - 1)
+    return wide.flatten()[index] & inside_grid
+
+
+def _pixels(photo: Photo, centers: Float[Tensor, "M 3"], voxel: float) -> tuple[Int64[Tensor, "K"], Int64[Tensor, "K"]]:
+    """Which centres the photo shows, and the pixel of each, counted from 0 without gaps."""
+    column, row, depth = project(photo.camera, centers)
+    shown = torch.nonzero(inside(photo.camera, column, row, depth))[:, 0]
+    if len(shown) == 0:
+        return shown, shown
+    step = max(1.0, voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth[shown].median()))
+    width = math.ceil(photo.camera.width / step) + 1
+    pixel = (row[shown] / step).long() * width + (column[shown] / step).long()
+    return shown, torch.unique(pixel, return_inverse=True)[1]
+
+
+def _uncovered_share(rows: Tensor, pixel: Tensor, stays: Bool[Tensor, "M P"]) -> Float[Tensor, "P"]:
+    if len(rows) == 0:
+        return torch.zeros(stays.shape[1])
+    covered = torch.zeros(int(pixel.max()) + 1, stays.shape[1])
+    covered.scatter_reduce_(0, pixel[:, None].expand(-1, stays.shape[1]), stays[rows].float(), "amax")
+    return 1 - covered.mean(0)
+
+
+def refined(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[Mirror, float]:
+    """The plane moved to where the outlines miss least (Levenberg-Marquardt over two tilts and the offset), and the
+    root mean square of what is left, px. Gives up where HOPE steps leave more than HOPELESS times what is `wanted`."""
+    misses, damping = silhouettes.misses(mirror), 1e-2
+    for iteration in range(ITERATIONS):
+        if iteration == HOPE and _rms(misses) > HOPELESS * wanted:
+            break
+        J = _jacobian(mirror, silhouettes, ball)
+        A, b = J.T @ J, J.T @ misses
+        step = None
+        for _ in range(TRIES):
+            tried = -torch.linalg.solve(A + damping * torch.diag(A.diagonal() + 1e-6), b)
+            moved = _moved(mirror, tried, ball)
+            left = silhouettes.misses(moved)
+            if _rms(left) < GAIN * _rms(misses):
+                step, mirror, misses, damping = tried, moved, left, max(damping / 4, 1e-6)
+                break
+            damping *= 4
+        if step is None or float(step.abs().max()) < FINE:
+            break
+    return mirror, _rms(misses)
+
+
+def _rms(misses: Float[Tensor, "P"]) -> float:
+    return float(misses.square().mean().sqrt())
+
+
+def _jacobian(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, step: float = 2e-3) -> Float[Tensor, "P 3"]:
+    """d(misses)/d(tilt, tilt, shift) by central differences."""
+    columns = []
+    for change in step * torch.eye(3):
+        ahead, behind = (silhouettes.misses(_moved(mirror, way * change, ball)) for way in (1, -1))
+        columns.append((ahead - behind) / (2 * step))
+    return torch.stack(columns, 1)
+
+
+def _moved(mirror: Mirror, change: Float[Tensor, "3"], ball: Ball) -> Mirror:
+    """The plane turned about the ball's centre by two small angles (radians) and shifted by a share of its radius."""
+    n = mirror.normal
+    axis = torch.eye(3)[int(n.abs().numpy().argmin())]
+    u = torch.nn.functional.normalize(torch.linalg.cross(n, axis), dim=0)
+    normal = torch.nn.functional.normalize(n + change[0] * u + change[1] * torch.linalg.cross(n, u), dim=0)
+    shift = mirror.offset - float(n @ ball.center) + float(change[2]) * ball.radius
+    return Mirror(normal, float(normal @ ball.center) + shift)

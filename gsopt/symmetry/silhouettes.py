@@ -1,0 +1,147 @@
+"""How well silhouettes agree with a mirror plane, to fractions of a pixel.
+
+Silhouettes of one object cohere: on the ray of every outline pixel lies a point that no other silhouette excludes
+(Hernández, Schmitt & Cipolla 2007, who find cameras that way). If the object is symmetric, the silhouettes that its
+mirror images would have must cohere with the photos' too. With s_v(x) the signed distance of x to the outline in view
+v, in pixels and positive inside, and M the reflection, an outline pixel p of view i misses by
+
+    (1)  r_p = max(0, -max over x on the ray of p of min over v of min(s_v(x), s_v(M x))).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from gsopt.init.photos import Photo, sample
+from gsopt.init.rig import project
+from gsopt.init.rounded import squared_distance
+from gsopt.symmetry.mirror import Mirror
+
+RAYS = 120
+"""Per photo: outline pixels, evenly spaced, that are asked."""
+SAMPLES = 64
+"""Points along a ray; around the best of them AROUND more."""
+AROUND = 9
+FINER = 4
+"""Outlines are drawn on a grid so many times finer than the pixels, where alpha passes one half."""
+REACH = 12
+"""Distance from the outline at which the signed distance ends, px."""
+SLACK = 1.5
+"""Points are tried where the photos themselves exclude them by no more than this, px."""
+WORST = 4.0
+"""A pixel misses by this at most, px: one that sees another part of the object must not decide alone."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """One silhouette."""
+
+    photo: Photo
+    distance: Float[Tensor, "1 FH FW"]
+    """Signed, px, positive inside; on the finer grid."""
+
+    def at(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
+        """Signed distance of projected points, px; far outside behind the camera."""
+        column, row, depth = project(self.photo.camera, points.reshape(-1, 3))
+        before = depth > 1e-6
+        column, row = (torch.where(before, coordinate, 0.0) for coordinate in (column, row))
+        found = sample(self.distance, FINER * column, FINER * row)[0]
+        return torch.where(before, found, -float(REACH)).view(points.shape[:-1])
+
+
+class Silhouettes:
+    """Outlines of the photos and the rays through them, ready to be asked about mirrors."""
+
+    def __init__(self, photos: list[Photo], center: Float[Tensor, "3"], radius: float) -> None:
+        """All of the object lies within `radius` of `center`, scene units."""
+        self.outlines = [Outline(photo, signed_distance(photo)) for photo in photos]
+        rays = [_rays(outline, center, radius) for outline in self.outlines]
+        self._origins, self._directions, self._depths = (torch.cat(parts) for parts in zip(*rays, strict=True))
+        self._own = torch.cat([torch.full((len(origins),), row) for row, (origins, _, _) in enumerate(rays)])
+        points = self._points(self._depths)
+        others = self._among_others(points, self._own[:, None])
+        self._kept = others > -SLACK
+        self._kept_points, self._kept_others = points[self._kept], others[self._kept]
+
+    def misses(self, mirror: Mirror) -> Float[Tensor, "R"]:
+        """(1) for the rays of all photos, px, at most WORST."""
+        smallest = torch.full(self._kept.shape, -float(REACH))
+        smallest[self._kept] = torch.minimum(self._kept_others, self._behind(mirror, self._kept_points))
+        best, index = smallest.max(1)
+        # The best point lies between two samples.
+        depth = self._depths.gather(1, index[:, None])
+        points = self._points(depth + torch.linspace(-1, 1, AROUND) * (self._depths[:, 1:2] - self._depths[:, :1]))
+        around = torch.minimum(self._among_others(points, self._own[:, None]), self._behind(mirror, points))
+        return (-torch.maximum(best, around.amax(1))).clamp(0, WORST)
+
+    def _points(self, depths: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
+        return self._origins[:, None] + self._directions[:, None] * depths[..., None]
+
+    def _among_others(self, points: Float[Tensor, "R S 3"], own: Int64[Tensor, "R 1"]) -> Float[Tensor, "R S"]:
+        """The smallest signed distance in all photos but the ray's own."""
+        smallest = torch.full(points.shape[:-1], float(REACH))
+        for index, outline in enumerate(self.outlines):
+            smallest = torch.where(own == index, smallest, torch.minimum(smallest, outline.at(points)))
+        return smallest
+
+    def _behind(self, mirror: Mirror, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
+        """The smallest signed distance of the mirror image in all photos."""
+        reflected = mirror.reflect(points)
+        smallest = torch.full(points.shape[:-1], float(REACH))
+        for outline in self.outlines:
+            smallest = torch.minimum(smallest, outline.at(reflected))
+        return smallest
+
+
+def _rays(
+    outline: Outline, center: Float[Tensor, "3"], radius: float
+) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"], Float[Tensor, "R S"]]:
+    """Origins, directions and the depths of the samples of the rays through an outline's pixels."""
+    camera = outline.photo.camera
+    column, row = outline_pixels(outline)
+    K, R, t = camera.Ks[0], camera.viewmats[0, :3, :3], camera.viewmats[0, :3, 3]
+    x, y = (column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]
+    directions = x[:, None] * R[0] + y[:, None] * R[1] + R[2]
+    middle = float((center * R[2]).sum() + t[2])
+    depths = torch.linspace(max(middle - radius, 1e-3 * abs(middle)), middle + radius, SAMPLES)
+    return camera.centers.expand(len(column), 3), directions, depths.expand(len(column), SAMPLES)
+
+
+def signed_distance(photo: Photo) -> Float[Tensor, "1 FH FW"]:
+    """To the line where alpha passes one half, px, positive inside, ending at REACH."""
+    planes = photo.alpha()[None]
+    finer = torch.nn.functional.interpolate(planes, scale_factor=FINER, mode="bilinear", align_corners=False)[0]
+    solid, reach = finer > 0.5, REACH * FINER
+    inner, outer = (
+        squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~solid, solid)
+    )
+    return torch.where(solid, inner, -outer) / FINER
+
+
+def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
+    """Column and row of up to RAYS points on an outline: pixels at the silhouette's edge, moved onto the line."""
+    solid = outline.photo.alpha()[0] > 0.5
+    outside = torch.nn.functional.pad((~solid)[None, None].float(), (1,) * 4, value=1.0)
+    edge = torch.nonzero(solid & (torch.nn.functional.max_pool2d(outside, 3, 1)[0, 0] > 0))
+    edge = edge[:: max(1, math.ceil(len(edge) / RAYS))]
+    row, column = (edge + 0.5).unbind(1)
+    for _ in range(2):
+        here = sample(outline.distance, FINER * column, FINER * row)[0]
+        across = _slope(outline, column, row, 0.5, 0.0)
+        down = _slope(outline, column, row, 0.0, 0.5)
+        steep = (across**2 + down**2).clamp(min=0.25)
+        column, row = column - here * across / steep, row - here * down / steep
+    return column, row
+
+
+def _slope(outline: Outline, column: Tensor, row: Tensor, across: float, down: float) -> Float[Tensor, "R"]:
+    """Difference of the signed distance over one pixel."""
+    ahead, behind = (
+        sample(outline.distance, FINER * (column + way * across), FINER * (row + way * down))[0] for way in (1, -1)
+    )
+    return ahead - behind

@@ -1,0 +1,32 @@
+"""Before the first step: the mirrors of the object, found once, then kept with the run."""
+
+from __future__ import annotations
+
+from gsopt.config import TrainConfig
+from gsopt.data.scene import Scene
+from gsopt.errors import InputError
+from gsopt.symmetry.find import Symmetry, find_symmetries, with_mirror_images
+from gsopt.training import schedule
+from gsopt.training.run_directory import RunDirectory
+
+
+def with_mirrors(config: TrainConfig, scene: Scene, directory: RunDirectory) -> Scene:
+    """The scene with the mirror images of its photos, where they are few and the object is symmetric. A resumed run
+    keeps the mirrors it began with."""
+    recorded = directory.recorded("symmetry")
+    if recorded is None:
+        found = find_symmetries(scene) if is_wanted(config, scene) else []
+        recorded = [symmetry.to_dict() for symmetry in found]
+        directory.record(symmetry=recorded)
+    try:
+        return with_mirror_images(scene, [Symmetry.from_dict(values) for values in recorded])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"`symmetry` in {directory.path / 'config.json'} lacks or garbles {error}. Start in another folder."
+        ) from error
+
+
+def is_wanted(config: TrainConfig, scene: Scene) -> bool:
+    """Whether this run looks for mirrors. Not while poses are corrected: their errors would go into the mirrors."""
+    few = schedule.is_sparse(config, len(scene.train))
+    return few and config.sparse.symmetry == "auto" and not config.poses.refine

@@ -1,0 +1,118 @@
+"""Which mirrors are found, and which are not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from balls import Ball, mirrored, ring, write_balls
+
+from gsopt.data.scene import Scene, load_scene
+from gsopt.init.photos import small_photos
+from gsopt.symmetry.find import COLORS, MISSES, Symmetry, find_symmetries, with_mirror_images
+from gsopt.symmetry.mirror import Mirror
+from gsopt.symmetry.silhouettes import REACH, Silhouettes, signed_distance
+
+HALF = [Ball((0.5, 0.1, 0.0), 0.35), Ball((0.35, 0.5, 0.3), 0.2, (40, 90, 220)), Ball((0.6, -0.4, -0.2), 0.15)]
+"""Beside the plane x = 0; with their mirror images nothing else about them is symmetric."""
+LOPSIDED = [*HALF, Ball((-0.4, 0.0, 0.5), 0.3), Ball((-0.2, -0.5, -0.4), 0.25)]
+
+
+def slanted() -> Mirror:
+    return Mirror(torch.nn.functional.normalize(torch.tensor([0.9, 0.35, 0.25]), dim=0), 0.07)
+
+
+def degrees_between(a: Mirror, b: Mirror) -> float:
+    return math.degrees(math.acos(min(1.0, abs(float((a.normal * b.normal).sum())))))
+
+
+def scene_of(folder: Path, balls: list[Ball], views: int = 4) -> Scene:
+    return load_scene(write_balls(folder, balls, ring(views)))
+
+
+@pytest.mark.parametrize("mirror", [Mirror(torch.tensor([1.0, 0, 0]), 0.0), slanted()], ids=["x", "slanted"])
+def test_the_mirror_of_a_symmetric_thing_is_found(mirror: Mirror, tmp_path: Path) -> None:
+    found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, mirror)))
+    assert len(found) == 1
+    assert degrees_between(found[0].mirror, mirror) < 1
+    middle = torch.zeros(3) + mirror.offset * mirror.normal
+    assert abs(float(found[0].mirror.distance(middle))) < 0.02
+    assert found[0].misses <= MISSES
+    assert found[0].colored
+
+
+def test_a_lopsided_thing_has_none(tmp_path: Path) -> None:
+    assert find_symmetries(scene_of(tmp_path / "thing", LOPSIDED)) == []
+
+
+def test_a_thing_with_two_mirrors_has_both(tmp_path: Path) -> None:
+    x, y = (Mirror(normal, 0.0) for normal in torch.eye(3)[:2])
+    quarter = [Ball((0.4, 0.3, 0.2), 0.3), Ball((0.6, 0.2, -0.3), 0.2), Ball((0.2, 0.5, -0.5), 0.15)]
+    found = find_symmetries(scene_of(tmp_path / "thing", mirrored(mirrored(quarter, x), y)))
+    assert len(found) == 2
+    assert sorted(min(degrees_between(symmetry.mirror, mirror) for symmetry in found) < 1 for mirror in (x, y))
+
+
+def test_paint_that_is_not_symmetric_is_noticed(tmp_path: Path) -> None:
+    found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, slanted(), repaint=True)))
+    assert [degrees_between(symmetry.mirror, slanted()) < 1 for symmetry in found] == [True]
+    assert found[0].disagreement > COLORS
+    assert not found[0].colored
+
+
+def test_pictures_without_masks_have_no_outline(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()))
+    assert find_symmetries(replace(scene, has_alpha=False)) == []
+    assert find_symmetries(replace(scene, train=scene.train[:1])) == []
+
+
+def test_twice_the_same_bits(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()))
+    first, second = ([symmetry.to_dict() for symmetry in find_symmetries(scene)] for _ in range(2))
+    assert first == second
+    again = Symmetry.from_dict(first[0])
+    assert again.to_dict() == first[0]
+    assert torch.equal(again.mirror.normal, Symmetry.from_dict(second[0]).mirror.normal)
+
+
+def test_mirror_images_are_flipped_photos_seen_from_behind(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()))
+    plain, painted = Symmetry(slanted(), 0.0, 0.0), Symmetry(slanted(), 0.0, 1.0)
+    whole = with_mirror_images(scene, [plain, painted])
+    assert whole.train == scene.train
+    assert len(whole.mirrored) == 8
+    assert len(whole.drawn) == 12
+    assert len({view.name for view in whole.drawn}) >= 8
+    for photo, image, outline in zip(whole.train, whole.mirrored[:4], whole.mirrored[4:], strict=True):
+        assert torch.equal(image.pixels(), photo.pixels().flip(1))
+        assert torch.equal(image.camera.viewmats, slanted().camera(photo.camera).viewmats)
+        assert (photo.color, outline.color) == (1, 0)
+        assert 0 < image.color <= 1
+
+
+def test_the_signed_distance_is_that_to_the_outline(tmp_path: Path) -> None:
+    """Of a disc: known at every pixel."""
+    scene = scene_of(tmp_path / "disc", [Ball((0.0, 0.0, 0.0), 0.6)])
+    (photo,) = small_photos(scene.train[:1], 1)
+    distance = signed_distance(photo)[0]
+    y, x = (torch.arange(size, dtype=torch.float64) + 0.5 for size in distance.shape)
+    from_center = ((x / 4 - 48) ** 2 + (y[:, None] / 4 - 48) ** 2).sqrt()
+    radius = math.sqrt(float(photo.alpha().sum()) / math.pi)
+    expected = (radius - from_center).clamp(-REACH, REACH)
+    assert float((distance - expected).abs().max()) < 0.35
+
+
+def test_outlines_miss_more_the_further_the_mirror_is_off(tmp_path: Path) -> None:
+    photos = small_photos(scene_of(tmp_path / "thing", mirrored(HALF, slanted())).train, 4)
+    silhouettes = Silhouettes(photos, torch.zeros(3), 1.2)
+    n = slanted().normal
+    across = torch.nn.functional.normalize(torch.linalg.cross(n, torch.tensor([0.0, 0, 1])), dim=0)
+    left = []
+    for degrees in (0, 1, 2, 4):
+        angle = math.radians(degrees)
+        left.append(float(silhouettes.misses(Mirror(math.cos(angle) * n + math.sin(angle) * across, 0.07)).norm()))
+    assert left == sorted(left)
+    assert left[1] > 2 * left[0]
