@@ -95,6 +95,8 @@ def started_line(event: Mapping[str, Any], run: Path) -> str:
     views = f"{event['train_views']} input view{'s' * (event['train_views'] != 1)}"
     views += f", {event['test_views']} held out" if event["test_views"] else ", none held out"
     few = " (few: regularisers on)" if event["sparse"] else ""
+    if mirrors := event["mirrors"]:
+        few += f", symmetric: every view counts once more behind {mirrors} mirror{'s' * (mirrors != 1)}"
     begin = f"resumed at step {event['step']}" if event["step"] else f"init {event['init']}"
     return f"backend {event['backend']} | {views}{few} | {begin} | {event['n']:,} Gaussians | {run}"
 

@@ -184,12 +184,22 @@ def settings(report: Report) -> str:
     """Every setting; what differs from the default stands out."""
     default = TrainConfig().to_dict()
     rows = "".join(_setting_rows(report.config.to_dict(), default))
-    init = report.recorded.get("gaussians_init")
-    extra = f"<tr><th scope='row'>first Gaussians</th><td>{escape(str(init))}</td></tr>" if init else ""
+    facts = {"first Gaussians": report.recorded.get("gaussians_init"), "symmetry": _symmetry(report)}
+    extra = "".join(
+        f"<tr><th scope='row'>{name}</th><td>{escape(str(fact))}</td></tr>" for name, fact in facts.items() if fact
+    )
     return (
         "<section><details><summary>Settings</summary><p class='muted'>What differs from the default is bold.</p>"
         f'<div class="scroll"><table class="settings"><tbody>{extra}{rows}</tbody></table></div></details></section>\n'
     )
+
+
+def _symmetry(report: Report) -> str:
+    """The mirrors that were found, and whether colors were learned from them too."""
+    mirrors = report.recorded.get("symmetry")
+    if not isinstance(mirrors, list):
+        return ""
+    return "; ".join(mirror["about"] for mirror in mirrors if isinstance(mirror, dict) and "about" in mirror)
 
 
 def _setting_rows(values: dict[str, Any], default: dict[str, Any], prefix: str = "") -> Iterable[str]:

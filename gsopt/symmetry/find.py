@@ -18,7 +18,7 @@ from gsopt.symmetry.search import Ball, bounding_ball, candidates, refined, same
 from gsopt.symmetry.silhouettes import Silhouettes
 
 PHOTOS = 8
-"""Silhouettes that are asked, the farthest apart: more cost time, and 4 tell already."""
+"""Silhouettes that are asked, the farthest apart: 4 tell already."""
 MISSES = 0.004
 """A mirror is believed where the outlines miss by no more than this (root mean square), in radii of the object."""
 TWICE = 10.0
@@ -27,7 +27,7 @@ COLORS = 0.45
 """The colours of its mirror images are believed where they disagree by no more than this."""
 COLOR = 0.3
 """Weight of their colours then: light falls on one side, and where a photo shows a place it is the photo that decides.
-Of 8 objects, 4 views, one plane each: 1 gave 0.2 dB less than 0.4, and 0.3 as much more."""
+docs/decisions/0002-symmetry.md has the figures."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,17 @@ class Symmetry:
         """Whether the paint is symmetric too."""
         return self.disagreement <= COLORS
 
+    @property
+    def about(self) -> str:
+        """For people."""
+        x, y, z = self.mirror.normal.tolist()
+        used = "shape and colors" if self.colored else "shape alone: the colors are not symmetric"
+        return f"mirror plane ({x:.3f}, {y:.3f}, {z:.3f}) · x = {self.mirror.offset:.3g}, {used}"
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; `from_dict` is its inverse, to the bit."""
         plane = {"normal": self.mirror.normal.tolist(), "offset": self.mirror.offset}
-        return {**plane, "misses": self.misses, "disagreement": self.disagreement}
+        return {**plane, "misses": self.misses, "disagreement": self.disagreement, "about": self.about}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Symmetry:
