@@ -33,6 +33,7 @@ from gsopt.sds.view_prior import WARPED
 from gsopt.sds.views import nearest, square, square_views
 from gsopt.sds.warp import warp
 from gsopt.training import schedule
+from gsopt.training.mirrors import with_mirrors
 from gsopt.training.trainer import Trainer
 
 INPUTS = (3, 4, 4, 5, 6, 8)
@@ -121,6 +122,7 @@ def fitted(scene: Scene, length: int, seed: int, backend: Backend) -> Iterator[G
         preview_every=0,
         seed=seed,
     )
+    scene = with_mirrors(config, scene)
     degree = schedule.max_sh_degree(config, len(scene.train))
     gaussians, _ = first_gaussians(scene, config.init, degree, seed)
     trainer = Trainer(config, scene, gaussians, backend)

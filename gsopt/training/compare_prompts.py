@@ -20,6 +20,7 @@ from gsopt.sds.prior import Prior
 from gsopt.sds.views import square_views
 from gsopt.training.guidance import EMBEDDED_INPUTS, front_camera, read_references
 from gsopt.training.leave_one_out import WHITE, Left, short_config, short_run, spread_views, without
+from gsopt.training.mirrors import with_mirrors
 
 Say = Callable[[str], None]
 
@@ -77,6 +78,7 @@ def compare_prompts(
             f"The prior {prior.name} takes no words: every set of prompts would give the same. Name a Stable Diffusion "
             "model with --prior sd21 or a diffusers folder."
         )
+    scene = with_mirrors(config, scene)
     short = short_config(config, scene, prior.aligned)
     lefts = [without(scene, index) for index in spread_views(scene, max(1, config.guidance.guard_views))]
     truths: list[Tensor] = []

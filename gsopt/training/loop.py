@@ -27,7 +27,7 @@ from gsopt.training.guard import require_finite, require_finite_loss
 from gsopt.training.guidance import RunGuidance
 from gsopt.training.guided_run import start_guidance
 from gsopt.training.interrupt import StopRequest
-from gsopt.training.mirrors import with_mirrors
+from gsopt.training.mirrors import with_recorded_mirrors
 from gsopt.training.run_directory import Listener, RunDirectory, opened
 from gsopt.training.trainer import Trainer
 
@@ -76,7 +76,7 @@ def train(
         with one_torch_thread():
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
-            scene = with_mirrors(config, scene, directory)
+            scene = with_recorded_mirrors(config, scene, directory)
             config = schedule.shortened(config, len(scene.train))
             guidance = start_guidance(config, scene, backend, directory)
             trainer, clock = _start(config, scene, backend, directory, guidance, began)

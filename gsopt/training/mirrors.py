@@ -10,13 +10,24 @@ from gsopt.training import schedule
 from gsopt.training.run_directory import RunDirectory
 
 
-def with_mirrors(config: TrainConfig, scene: Scene, directory: RunDirectory) -> Scene:
-    """The scene with the mirror images of its photos, where they are few and the object is symmetric. A resumed run
-    keeps the mirrors it began with."""
+def symmetries(config: TrainConfig, scene: Scene) -> list[Symmetry]:
+    """The mirrors this run uses: none unless the photos are few and all have alpha. Not while poses are corrected:
+    their errors would go into the mirrors."""
+    few = schedule.is_sparse(config, len(scene.train))
+    wanted = few and config.sparse.symmetry == "auto" and not config.poses.refine
+    return find_symmetries(scene) if wanted else []
+
+
+def with_mirrors(config: TrainConfig, scene: Scene) -> Scene:
+    """The scene with the mirror images of its photos, where they are few and the object is symmetric."""
+    return with_mirror_images(scene, symmetries(config, scene))
+
+
+def with_recorded_mirrors(config: TrainConfig, scene: Scene, directory: RunDirectory) -> Scene:
+    """The same; a resumed run keeps the mirrors it began with. InputError for a garbled record."""
     recorded = directory.recorded("symmetry")
     if recorded is None:
-        found = find_symmetries(scene) if is_wanted(config, scene) else []
-        recorded = [symmetry.to_dict() for symmetry in found]
+        recorded = [symmetry.to_dict() for symmetry in symmetries(config, scene)]
         directory.record(symmetry=recorded)
     try:
         return with_mirror_images(scene, [Symmetry.from_dict(values) for values in recorded])
@@ -24,9 +35,3 @@ def with_mirrors(config: TrainConfig, scene: Scene, directory: RunDirectory) -> 
         raise InputError(
             f"`symmetry` in {directory.path / 'config.json'} lacks or garbles {error}. Start in another folder."
         ) from error
-
-
-def is_wanted(config: TrainConfig, scene: Scene) -> bool:
-    """Whether this run looks for mirrors. Not while poses are corrected: their errors would go into the mirrors."""
-    few = schedule.is_sparse(config, len(scene.train))
-    return few and config.sparse.symmetry == "auto" and not config.poses.refine
