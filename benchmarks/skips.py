@@ -2,7 +2,8 @@
 
     python benchmarks/skips.py --root DATA [--arm lego-plain ...] [--runs FOLDER] [--draw]
 
-DATA holds `nerf_synthetic_lego_400` and `fox`. Arms of each scene: `plain` (every skip off), `all` (every skip on) and
+DATA holds `nerf_synthetic_lego_400` and `fox`. Arms of each scene: `plain` (every skip off but the kernels' own),
+`bare` (those off as well), `all` (every skip on), `free` (only those that cost no more than 0.1 dB on either scene) and
 `no-X` (every skip but X). An arm is one `gsopt train --threads 1` in a process of its own; its CPU time (user and
 system, all threads, over the training steps alone) and its held-out metrics go to benchmarks/results/skips.json. Arms
 that have a record are not measured again, an arm that was cut short goes on from its last checkpoint, and a skip that
@@ -32,6 +33,7 @@ RESULT = ROOT / "benchmarks" / "results" / "skips.json"
 PAGE = ROOT / "docs" / "performance.md"
 FORK = 4000
 """Before the last refinement of 7000 steps, which views that rest and flat losses wait for."""
+TOGETHER = (("plain", "bare"), ("free", "bare"), ("all", "plain"), ("all", "bare"))
 METRICS = ("psnr", "ssim", "lpips_alex")
 RECORD = {
     "scene": str,
@@ -87,6 +89,20 @@ SKIPS = (
     ),
     Skip("bands", "SH bands by the residual", ("--schedule.bands", "residual"), ("--schedule.bands", "steps")),
 )
+FREE = ("coarse", "crop", "flat")
+"""What `free` leaves out beside the kernels' own: by the rows of the table."""
+BARE = """
+import sys
+from gsopt.cli import main
+from gsopt.raster.cpu_backend import CpuBackend
+made = CpuBackend.__init__
+def without_skips(self, threads=0):
+    made(self, threads)
+    self._workspace.skip_tiles = self._workspace.skip_terminated = False
+CpuBackend.__init__ = without_skips
+sys.exit(main(sys.argv[1:]))
+"""
+"""gsopt with the kernels' own skips switched off, for python -c."""
 SCENES = {"lego": ("nerf_synthetic_lego_400", (), True), "fox": ("fox", ("-r", "4", "--eval"), False)}
 """Folder, flags, and whether the images carry masks."""
 COMMON = ("--threads", "1", "--preview-every", "0", "--lambda-sds", "0")
@@ -116,6 +132,9 @@ def arms() -> list[Arm]:
         for scene in SCENES
         for name, way in (("plain", "off"), ("all", "on"))
     ]
+    for name, chosen in (("bare", ()), ("free", FREE)):
+        flags = tuple(flag for skip in SKIPS for flag in (skip.on if skip.name in chosen else skip.off))
+        found += [Arm(scene, name, flags) for scene in SCENES]
     for without in SKIPS:
         flags = tuple(flag for skip in SKIPS for flag in (skip.off if skip is without else skip.on))
         found += [Arm(scene, f"no-{without.name}", flags, without) for scene in SCENES]
@@ -137,7 +156,8 @@ def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[s
     if arm.without is not None and arm.without.setting is not None:
         command = ["train", "--threads", "1", "--preview-every", "0"]
     if not (run / "metrics.json").exists():  # it is written last
-        finish(arm, [sys.executable, "-m", "gsopt", *command, "-m", str(run), "--resume"], run)
+        start = ["-c", BARE] if arm.name == "bare" else ["-m", "gsopt"]
+        finish(arm, [sys.executable, *start, *command, "-m", str(run), "--resume"], run)
     metrics = json.loads((run / "metrics.json").read_bytes())
     return {
         "scene": arm.scene,
@@ -217,15 +237,15 @@ def page(records: dict[str, Any]) -> str:
             full, without = records.get(f"{scene}-all"), records.get(f"{scene}-no-{skip.name}")
             if full and without:
                 rows.append([skip.what, scene, *difference(without, full)])
-    for scene in SCENES:
-        plain, full = records.get(f"{scene}-plain"), records.get(f"{scene}-all")
-        if plain and full:
-            factor = plain["cpu_seconds"] / full["cpu_seconds"]
-            saved, *changes = difference(plain, full)
-            rows.append([f"**all together: {factor:.2f}x**", scene, saved, *changes])
+    for name, than in TOGETHER:
+        for scene in SCENES:
+            slow, fast = records.get(f"{scene}-{than}"), records.get(f"{scene}-{name}")
+            if slow and fast:
+                factor = slow["cpu_seconds"] / fast["cpu_seconds"]
+                rows.append([f"**`{name}` for `{than}`: {factor:.2f}x**", scene, *difference(slow, fast)])
     absolute = [
         [r["scene"], r["arm"], f"{r['cpu_seconds']:.0f} s", f"{r['gaussians']:,}", str(r["steps"]), *figures(r)]
-        for key in (f"{scene}-{arm}" for scene in SCENES for arm in ("plain", "all"))
+        for key in (f"{scene}-{arm}" for scene in SCENES for arm in ("bare", "plain", "free", "all"))
         if (r := records.get(key))
     ]
     absolute_head = ["scene", "arm", "CPU time", "Gaussians", "steps", "PSNR, dB", "SSIM", "LPIPS (Alex)"]
