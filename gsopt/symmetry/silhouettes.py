@@ -27,8 +27,8 @@ RAYS = 120
 SAMPLES = 64
 """Points along a ray; around the best of them AROUND more."""
 AROUND = 9
-FINER = 4
-"""Outlines are drawn on a grid so many times finer than the pixels, where alpha passes one half."""
+FINEST = 1024
+"""Outlines are drawn, where alpha passes one half, on a grid 2 or 4 times finer than the pixels, up to this long."""
 REACH = 12
 """Distance from the outline at which the signed distance ends, px."""
 SLACK = 1.5
@@ -45,13 +45,22 @@ class Outline:
     distance: Float[Tensor, "1 FH FW"]
     """Signed, px, positive inside; on the finer grid."""
 
+    @staticmethod
+    def of(photo: Photo) -> Outline:
+        finer = 4 if 4 * max(photo.camera.width, photo.camera.height) <= FINEST else 2
+        return Outline(photo, signed_distance(photo.alpha(), finer))
+
     def at(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
         """Signed distance of projected points, px; far outside behind the camera."""
         column, row, depth = project(self.photo.camera, points.reshape(-1, 3))
         before = depth > 1e-6
         column, row = (torch.where(before, coordinate, 0.0) for coordinate in (column, row))
-        found = sample(self.distance, FINER * column, FINER * row)[0]
-        return torch.where(before, found, -float(REACH)).view(points.shape[:-1])
+        return torch.where(before, self.here(column, row), -float(REACH)).view(points.shape[:-1])
+
+    def here(self, column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """Signed distance at pixel coordinates, px."""
+        finer = self.distance.shape[2] / self.photo.camera.width
+        return sample(self.distance, finer * column, finer * row)[0]
 
 
 class Silhouettes:
@@ -59,7 +68,7 @@ class Silhouettes:
 
     def __init__(self, photos: list[Photo], center: Float[Tensor, "3"], radius: float) -> None:
         """All of the object lies within `radius` of `center`, scene units."""
-        self.outlines = [Outline(photo, signed_distance(photo)) for photo in photos]
+        self.outlines = [Outline.of(photo) for photo in photos]
         rays = [_rays(outline, center, radius) for outline in self.outlines]
         self._origins, self._directions, self._depths = (torch.cat(parts) for parts in zip(*rays, strict=True))
         self._own = torch.cat([torch.full((len(origins),), row) for row, (origins, _, _) in enumerate(rays)])
@@ -112,15 +121,14 @@ def _rays(
     return camera.centers.expand(len(column), 3), directions, depths.expand(len(column), SAMPLES)
 
 
-def signed_distance(photo: Photo) -> Float[Tensor, "1 FH FW"]:
-    """To the line where alpha passes one half, px, positive inside, ending at REACH."""
-    planes = photo.alpha()[None]
-    finer = torch.nn.functional.interpolate(planes, scale_factor=FINER, mode="bilinear", align_corners=False)[0]
-    solid, reach = finer > 0.5, REACH * FINER
+def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, "1 FH FW"]:
+    """To the line where alpha passes one half, px, positive inside, ending at REACH; on a grid `finer` than pixels."""
+    planes = torch.nn.functional.interpolate(alpha[None], scale_factor=finer, mode="bilinear", align_corners=False)[0]
+    solid, reach = planes > 0.5, REACH * finer
     inner, outer = (
         squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~solid, solid)
     )
-    return torch.where(solid, inner, -outer) / FINER
+    return torch.where(solid, inner, -outer) / finer
 
 
 def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
@@ -131,7 +139,7 @@ def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, 
     edge = edge[:: max(1, math.ceil(len(edge) / RAYS))]
     row, column = (edge + 0.5).unbind(1)
     for _ in range(2):
-        here = sample(outline.distance, FINER * column, FINER * row)[0]
+        here = outline.here(column, row)
         across = _slope(outline, column, row, 0.5, 0.0)
         down = _slope(outline, column, row, 0.0, 0.5)
         steep = (across**2 + down**2).clamp(min=0.25)
@@ -141,7 +149,4 @@ def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, 
 
 def _slope(outline: Outline, column: Tensor, row: Tensor, across: float, down: float) -> Float[Tensor, "R"]:
     """Difference of the signed distance over one pixel."""
-    ahead, behind = (
-        sample(outline.distance, FINER * (column + way * across), FINER * (row + way * down))[0] for way in (1, -1)
-    )
-    return ahead - behind
+    return outline.here(column + across, row + down) - outline.here(column - across, row - down)
