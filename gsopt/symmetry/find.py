@@ -19,8 +19,9 @@ from gsopt.symmetry.silhouettes import Silhouettes
 
 PHOTOS = 8
 """Silhouettes that are asked, the farthest apart: 4 tell already."""
-MISSES = 0.004
-"""A mirror is believed where the outlines miss by no more than this (root mean square), in radii of the object."""
+MISSES = 0.014
+"""A mirror is believed where the outlines miss by no more than this over the number of photos (root mean square), in radii
+of the object: the more the photos show themselves, the surer it must be to add to them."""
 TWICE = 10.0
 """Mirrors nearer to each other than this are one, degrees."""
 COLORS = 0.45
@@ -74,10 +75,11 @@ def find_symmetries(scene: Scene) -> list[Symmetry]:
     ball = bounding_ball(grid)
     silhouettes = Silhouettes(photos, ball.center, ball.radius)
     pixels = sum(_seen_radius(photo, ball) for photo in photos) / len(photos)
+    most = MISSES / len(scene.train) * pixels
     found: list[Symmetry] = []
     for candidate in candidates(grid, photos, ball):
-        mirror, misses = refined(candidate, silhouettes, ball, MISSES * pixels)
-        if misses <= MISSES * pixels and not any(same(mirror, other.mirror, TWICE) for other in found):
+        mirror, misses = refined(candidate, silhouettes, ball, most)
+        if misses <= most and not any(same(mirror, other.mirror, TWICE) for other in found):
             shape = _symmetric_part(grid, photos, mirror)
             found.append(Symmetry(mirror, misses / pixels, disagreement(shape, photos, mirror, ball.radius)))
     return found

@@ -18,6 +18,9 @@ COARSE, COARSE_SPARSE = (0.06, 0.23), (1 / 6, 1 / 2)
 # The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
 GAUSSIANS_PER_PIXEL = 1.44
 SMALLEST_BUDGET, LARGEST_BUDGET = 20_000, 1_000_000
+# Mirror images drawn per epoch, times the number of photos: the more photos there are, the less they leave open and the
+# more the images blur what the photos show (docs/decisions/0002-symmetry.md).
+MIRRORED = 32
 # A reset takes about this many steps to heal: none is made so late that the run would end with its scar.
 STEPS_AFTER_RESET = 2000
 # Share of a run in which the rates fall, so that it does not end in the noise of the last few views it drew.
@@ -45,6 +48,11 @@ def shortened(config: TrainConfig, views: int) -> TrainConfig:
     if config.sparse.steps_per_view == 0 or not is_sparse(config, views):
         return config
     return replace(config, iterations=min(config.iterations, config.sparse.steps_per_view * views))
+
+
+def mirrored_per_epoch(views: int, images: int) -> int:
+    """How many of the mirror images are drawn beside every input view once."""
+    return min(images, round(MIRRORED / views))
 
 
 def weights(config: TrainConfig, views: int) -> Weights:

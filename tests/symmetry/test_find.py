@@ -40,7 +40,7 @@ def test_the_mirror_of_a_symmetric_thing_is_found(mirror: Mirror, tmp_path: Path
     assert degrees_between(found[0].mirror, mirror) < 1
     middle = torch.zeros(3) + mirror.offset * mirror.normal
     assert abs(float(found[0].mirror.distance(middle))) < 0.02
-    assert found[0].misses <= MISSES
+    assert found[0].misses <= MISSES / 4
     assert found[0].colored
 
 

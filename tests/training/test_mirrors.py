@@ -66,7 +66,7 @@ def test_the_side_that_no_photo_shows_is_learned_from_the_other(one_sided: Path,
     without_mirrors = replace(config, sparse=replace(config.sparse, symmetry="off"))
     with_them, alone = train(config, tmp_path / "mirrors"), train(without_mirrors, tmp_path / "alone")
     assert (started(tmp_path / "mirrors")["mirrors"], started(tmp_path / "alone")["mirrors"]) == (1, 0)
-    assert held_out_psnr(with_them.gaussians, with_them.scene) > held_out_psnr(alone.gaussians, alone.scene) + 1
+    assert held_out_psnr(with_them.gaussians, with_them.scene) > held_out_psnr(alone.gaussians, alone.scene) + 0.5
 
 
 def test_a_resumed_run_keeps_its_mirrors_and_its_bits(one_sided: Path, tmp_path: Path) -> None:

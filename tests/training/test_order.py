@@ -19,6 +19,15 @@ def test_every_epoch_sees_every_view_once(views: int, seed: int) -> None:
         assert sorted(order.next() for _ in range(views)) == list(range(views))
 
 
+def test_mirror_images_take_turns_among_the_views() -> None:
+    order = ViewOrder(4, generators(3)["views"], images=12, images_per_epoch=5)
+    epochs = [[order.next() for _ in range(9)] for _ in range(20)]
+    for epoch in epochs:
+        assert sorted(row for row in epoch if row < 4) == [0, 1, 2, 3]
+        assert len(set(epoch)) == 9
+    assert {row for epoch in epochs for row in epoch} == set(range(16))
+
+
 def test_epochs_are_shuffled_anew() -> None:
     order = ViewOrder(30, generators(0)["views"])
     first, second = ([order.next() for _ in range(30)] for _ in range(2))

@@ -149,3 +149,10 @@ def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
     assert schedule.coarse_until(config, 8) == (167, 500)
     full = replace(config, schedule=ScheduleConfig(coarse_until=()))
     assert schedule.coarse_until(full, 100) == ()
+
+
+@pytest.mark.parametrize(
+    ("views", "images", "drawn"), [(4, 4, 4), (4, 24, 8), (8, 8, 4), (8, 48, 4), (16, 16, 2), (5, 0, 0)]
+)
+def test_the_more_photos_the_fewer_mirror_images(views: int, images: int, drawn: int) -> None:
+    assert schedule.mirrored_per_epoch(views, images) == drawn
