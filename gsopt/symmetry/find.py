@@ -20,8 +20,8 @@ from gsopt.symmetry.silhouettes import Silhouettes
 PHOTOS = 8
 """Silhouettes that are asked, the farthest apart: 4 tell already."""
 MISSES = 0.014
-"""A mirror is believed where the outlines miss by no more than this over the number of photos (root mean square), in radii
-of the object: the more the photos show themselves, the surer it must be to add to them."""
+"""A mirror is believed where the outlines miss by no more than this over the number of photos (root mean square), in
+radii of the object: the more the photos show themselves, the surer it must be to add to them."""
 TWICE = 10.0
 """Mirrors nearer to each other than this are one, degrees."""
 COLORS = 0.45
