@@ -20,6 +20,7 @@ class Picture:
 
     values: Tensor
     reads: int = 0
+    color: float = 1.0
 
     @property
     def camera(self) -> Cameras:
