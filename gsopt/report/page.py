@@ -199,7 +199,7 @@ def _symmetry(report: Report) -> str:
     mirrors = report.recorded.get("symmetry")
     if not isinstance(mirrors, list):
         return ""
-    return "; ".join(mirror["about"] for mirror in mirrors if isinstance(mirror, dict) and "about" in mirror)
+    return "; ".join(str(mirror["about"]) for mirror in mirrors if isinstance(mirror, dict) and "about" in mirror)
 
 
 def _setting_rows(values: dict[str, Any], default: dict[str, Any], prefix: str = "") -> Iterable[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,9 +24,9 @@ def disagreement(grid: Grid, photos: list[Photo], mirror: Mirror, radius: float)
     the same between two places drawn blindly: 0 where all is symmetric, 1 where nothing is, or nothing is known."""
     surface = grid.surface()
     points = surface[mirror.distance(surface) > NEAR * radius]
-    here, seen_here = seen_colors(grid, photos, points)
-    there, seen_there = seen_colors(grid, photos, mirror.reflect(points))
-    both = seen_here & seen_there
+    colors, seen = seen_colors(grid, photos, torch.cat([points, mirror.reflect(points)]))
+    here, there = colors.chunk(2)
+    both = torch.logical_and(*seen.chunk(2))
     if int(both.sum()) < ENOUGH:
         return 1.0
     return float(_squared(here[both] - there[both]) / (_blind(here[both], there[both]) + 2 * NOISE**2))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
 from gsopt.data.scene import Scene, View
+from gsopt.errors import InputError
 from gsopt.init.hull import carve, in_hull
 from gsopt.init.photos import Photo, small_photos
 from gsopt.init.rig import find_focus
@@ -60,8 +62,12 @@ class Symmetry:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Symmetry:
-        mirror = Mirror(torch.tensor(values["normal"]), float(values["offset"]))
-        return Symmetry(mirror, float(values["misses"]), float(values["disagreement"]))
+        """KeyError, TypeError, ValueError or InputError for what `to_dict` never gives."""
+        numbers = [float(number) for number in (*values["normal"], values["offset"])]
+        normal = torch.tensor(numbers[:-1])
+        if len(normal) != 3 or not abs(float(normal.norm()) - 1) < 1e-4 or not math.isfinite(numbers[-1]):
+            raise InputError(f"the plane: normal {normal.tolist()}, offset {numbers[-1]}")
+        return Symmetry(Mirror(normal, numbers[-1]), float(values["misses"]), float(values["disagreement"]))
 
 
 def find_symmetries(scene: Scene) -> list[Symmetry]:
@@ -74,6 +80,8 @@ def find_symmetries(scene: Scene) -> list[Symmetry]:
         return []
     ball = bounding_ball(grid)
     silhouettes = Silhouettes(photos, ball.center, ball.radius)
+    if not silhouettes.outline_something:
+        return []
     pixels = sum(_seen_radius(photo, ball) for photo in photos) / len(photos)
     most = MISSES / len(scene.train) * pixels
     found: list[Symmetry] = []

@@ -32,6 +32,7 @@ ITERATIONS, TRIES = 15, 4
 GAIN, FINE = 0.995, 3e-4
 """It ends where a step leaves more than this share of the misses, or moves by less: radians, radii."""
 HOPE, HOPELESS = 4, 3.0
+"""It is given up where so many steps still leave so many times what is wanted."""
 _CHUNK = 32
 
 
@@ -140,7 +141,7 @@ def _uncovered_share(rows: Tensor, pixel: Tensor, stays: Bool[Tensor, "M P"]) ->
 
 def refined(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[Mirror, float]:
     """The plane moved to where the outlines miss least (Levenberg-Marquardt over two tilts and the offset), and the
-    root mean square of what is left, px. Gives up where HOPE steps leave more than HOPELESS times what is `wanted`."""
+    root mean square of what is left, px. One that stays far from `wanted` is given up."""
     misses, damping = silhouettes.misses(mirror), 1e-2
     for iteration in range(ITERATIONS):
         if iteration == HOPE and _rms(misses) > HOPELESS * wanted:

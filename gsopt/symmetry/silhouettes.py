@@ -33,6 +33,8 @@ REACH = 12
 """Distance from the outline at which the signed distance ends, px."""
 SLACK = 1.5
 """Points are tried where the photos themselves exclude them by no more than this, px."""
+FEWEST = 20
+"""Rays per photo below which nothing can be told: any mirror would do."""
 WORST = 4.0
 """A pixel misses by this at most, px: one that sees another part of the object must not decide alone."""
 
@@ -76,6 +78,11 @@ class Silhouettes:
         others = self._among_others(points, self._own[:, None])
         self._kept = others > -SLACK
         self._kept_points, self._kept_others = points[self._kept], others[self._kept]
+
+    @property
+    def outline_something(self) -> bool:
+        """False for opaque pictures, whose alpha has no edge."""
+        return len(self._origins) >= FEWEST * len(self.outlines)
 
     def misses(self, mirror: Mirror) -> Float[Tensor, "R"]:
         """(1) for the rays of all photos, px, at most WORST."""
@@ -132,10 +139,11 @@ def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, 
 
 
 def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-    """Column and row of up to RAYS points on an outline: pixels at the silhouette's edge, moved onto the line."""
+    """Column and row of up to RAYS points on an outline: pixels at the silhouette's edge, moved onto the line.
+    Where an object is cut off by the border of the image there is none."""
     solid = outline.photo.alpha()[0] > 0.5
-    outside = torch.nn.functional.pad((~solid)[None, None].float(), (1,) * 4, value=1.0)
-    edge = torch.nonzero(solid & (torch.nn.functional.max_pool2d(outside, 3, 1)[0, 0] > 0))
+    beside = torch.nn.functional.max_pool2d((~solid)[None, None].float(), 3, 1, padding=1)[0, 0] > 0
+    edge = torch.nonzero(solid & beside)
     edge = edge[:: max(1, math.ceil(len(edge) / RAYS))]
     row, column = (edge + 0.5).unbind(1)
     for _ in range(2):

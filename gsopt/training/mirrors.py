@@ -31,7 +31,7 @@ def with_recorded_mirrors(config: TrainConfig, scene: Scene, directory: RunDirec
         directory.record(symmetry=recorded)
     try:
         return with_mirror_images(scene, [Symmetry.from_dict(values) for values in recorded])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, InputError) as error:
         raise InputError(
             f"`symmetry` in {directory.path / 'config.json'} lacks or garbles {error}. Start in another folder."
         ) from error

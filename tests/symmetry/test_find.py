@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 from balls import Ball, mirrored, ring, write_balls
+from PIL import Image
 
 from gsopt.data.scene import Scene, load_scene
 from gsopt.init.photos import small_photos
 from gsopt.symmetry.find import COLORS, MISSES, Symmetry, find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
-from gsopt.symmetry.silhouettes import REACH, Silhouettes, signed_distance
+from gsopt.symmetry.silhouettes import REACH, Outline, Silhouettes, outline_pixels, signed_distance
 
 HALF = [Ball((0.5, 0.1, 0.0), 0.35), Ball((0.35, 0.5, 0.3), 0.2, (40, 90, 220)), Ball((0.6, -0.4, -0.2), 0.15)]
 """Beside the plane x = 0; with their mirror images nothing else about them is symmetric."""
@@ -67,6 +68,25 @@ def test_pictures_without_masks_have_no_outline(tmp_path: Path) -> None:
     scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()))
     assert find_symmetries(replace(scene, has_alpha=False)) == []
     assert find_symmetries(replace(scene, train=scene.train[:1])) == []
+
+
+def test_opaque_pictures_have_no_outline_either(tmp_path: Path) -> None:
+    """Their frusta are as symmetric as the cameras: that says nothing about what stands in them."""
+    scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()))
+    for path in (tmp_path / "thing" / "train").glob("*.png"):
+        Image.open(path).convert("RGB").convert("RGBA").save(path)
+    opaque = load_scene(scene.path)
+    assert opaque.has_alpha
+    assert find_symmetries(opaque) == []
+
+
+def test_the_border_of_a_picture_is_no_outline(tmp_path: Path) -> None:
+    """Of a ball that fills it from top to bottom only the sides are."""
+    scene = load_scene(write_balls(tmp_path / "ball", [Ball((0.0, 0.0, 0.0), 1.0)], ring(4, distance=3.6)))
+    (photo,) = small_photos(scene.train[:1], 1)
+    column, row = outline_pixels(Outline.of(photo))
+    assert len(row) > 0
+    assert float((column - 48).square().add((row - 48).square()).sqrt().std()) < 0.3
 
 
 def test_twice_the_same_bits(tmp_path: Path) -> None:

@@ -86,7 +86,18 @@ def test_a_resumed_run_keeps_its_mirrors_and_its_bits(one_sided: Path, tmp_path:
     assert (broken / "splat.ply").read_bytes() == (whole / "splat.ply").read_bytes()
 
 
-@pytest.mark.parametrize("garbled", [[{"normal": [1, 0]}], [{"offset": "x"}], [7], "x"])
+@pytest.mark.parametrize(
+    "garbled",
+    [
+        [{"normal": [1, 0]}],
+        [{"normal": [1, 0], "offset": 0, "misses": 0, "disagreement": 0}],
+        [{"normal": [1, 0, float("nan")], "offset": 0, "misses": 0, "disagreement": 0}],
+        [{"normal": [1, 1, 1], "offset": 0, "misses": 0, "disagreement": 0}],
+        [{"offset": "x"}],
+        [7],
+        "x",
+    ],
+)
 def test_garbled_mirrors_are_refused(garbled: object, one_sided: Path, tmp_path: Path) -> None:
     config, run = config_of(one_sided, iterations=2), tmp_path / "run"
     train(config, run)
