@@ -62,13 +62,14 @@ class DataConfig:
 class InitConfig:
     """The first Gaussians."""
 
-    method: Literal["auto", "points", "hull", "random"] = "auto"
-    """auto: SfM points when there are enough, else the visual hull when there is alpha, else random in the frustum."""
+    method: Literal["auto", "points", "hull", "stereo", "random"] = "auto"
+    """auto: SfM points when there are enough, else the visual hull when there is alpha, else with few photos the
+    places on which they agree (stereo), else random in the frustum."""
     count: int = 20_000
-    """How many to make (hull and random)."""
+    """How many to make; stereo adds as many at random."""
 
     def __post_init__(self) -> None:
-        check.one_of("--init", self.method, ("auto", "points", "hull", "random"))
+        check.one_of("--init", self.method, ("auto", "points", "hull", "stereo", "random"))
         check.within("--init-count", self.count, 1, MOST_GAUSSIANS, "The default is 20000.")
 
 

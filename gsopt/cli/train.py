@@ -92,10 +92,10 @@ class Flags:
     """The same as --background white, which is the default."""
     background: Literal["white", "black", "random"] | None = None
     """Behind transparent pixels: white when not given. random draws a color per step and evaluates on white."""
-    init: Literal["auto", "points", "hull", "random"] = "auto"
-    """First Gaussians: SfM points, the visual hull of the masks, or random ones where the cameras look."""
+    init: Literal["auto", "points", "hull", "stereo", "random"] = "auto"
+    """First Gaussians: SfM points, the visual hull of the masks, places on which photos agree by stereo, or random."""
     init_count: int = 20_000
-    """How many to make (hull and random)."""
+    """How many to make; stereo adds as many at random."""
     seed: int = 0
     """Same seed, same data, same bits."""
     backend: Literal["auto", "cpu", "reference"] = "auto"

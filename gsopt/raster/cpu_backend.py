@@ -19,6 +19,15 @@ from gsopt.raster.backend import Frame, Gradients, Photometric, RasterSettings
 ISA_VARIABLE = "GSOPT_ISA"
 
 
+def workspace(threads: int = 0) -> Any:
+    """What kernels run in: a pool of `threads` (0: one per core) and an instruction set, the best one or that which
+    the environment variable GSOPT_ISA (avx512, avx2, portable) names; UsageError if this processor lacks it."""
+    try:
+        return _cpu.Workspace(threads or _available_cores(), os.environ.get(ISA_VARIABLE, ""))
+    except ValueError as error:
+        raise UsageError(f"{ISA_VARIABLE}: {error}.") from error
+
+
 @dataclass
 class _Context:
     frame: Any
@@ -35,16 +44,12 @@ class _Context:
 
 
 class CpuBackend:
-    """`threads` = 0 takes one per core. The environment variable GSOPT_ISA (avx512, avx2, portable) overrides the
-    choice of instruction set; one that this processor lacks raises UsageError."""
+    """`threads` as for `workspace`."""
 
     name = "cpu"
 
     def __init__(self, threads: int = 0) -> None:
-        try:
-            self._workspace = _cpu.Workspace(threads or _available_cores(), os.environ.get(ISA_VARIABLE, ""))
-        except ValueError as error:
-            raise UsageError(f"{ISA_VARIABLE}: {error}.") from error
+        self._workspace = workspace(threads)
         self._idle: list[Any] = []  # frames whose buffers can be used again
 
     @property

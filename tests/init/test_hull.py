@@ -146,7 +146,7 @@ def test_silhouettes_that_outline_nothing_fall_back_or_say_so(tmp_path: Path, al
     gaussians, said = first_gaussians(scene, InitConfig(count=50), 0, 0)
     assert len(gaussians.validate()) == 50
     assert "random" in said
-    with pytest.raises(UsageError, match=r"--init\.method hull"):
+    with pytest.raises(UsageError, match="--init hull"):
         first_gaussians(scene, InitConfig(method="hull", count=50), 0, 0)
 
 

@@ -114,6 +114,23 @@ struct AdamArguments {
   float step_size, beta1, beta2, inv_sqrt_correction2, eps;
 };
 
+// One picture's windows against one other picture (cpu/match.h); pixels padded to a multiple of eight.
+struct MatchArguments {
+  int64_t padded;
+  int taps;
+  const float *offsets;            // [taps, 2], px
+  const float *rays;               // [2, padded]: x and y of (x, y, 1)
+  const float *windows;            // [padded / 8, taps, 2, 8]: a tap's weight, and that times the value less the mean
+  const float *inverse_deviation;  // [padded]
+  const float *planes;             // [3, padded]: inverse depth a x + b y + c
+  const float *corners;            // [height, width, 4]: value at a pixel, right of it, below it, and both
+  int width, height;
+  float A[9], T[3];      // source pixels, times depth, from the ray and the inverse depth
+  float step_x, step_y;  // of a pixel in the ray
+  float least_variance, unseen;
+  float* costs;  // [padded]
+};
+
 // What one core can do at best, lanes per second: fused multiply-adds, and exponentials.
 struct Calibration {
   double fma, exp;
@@ -129,6 +146,7 @@ struct Kernels {
   void (*project_backward)(Pool&, Frame&, const Parameters&, const ParameterGradients&);
   void (*photometric)(Pool&, PhotometricArguments&);
   void (*adam)(Pool&, const AdamArguments&);
+  void (*match)(Pool&, const MatchArguments&);
   Calibration (*calibrate)();
 };
 

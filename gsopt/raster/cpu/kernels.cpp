@@ -8,6 +8,7 @@
 #include "blend.h"
 #include "blend_backward.h"
 #include "calibrate.h"
+#include "match.h"
 #include "photometric.h"
 #include "project.h"
 
@@ -19,7 +20,7 @@ namespace gsopt::GSOPT_ISA {
 extern const Kernels kernels;
 const Kernels kernels = {
     GSOPT_STRING(GSOPT_ISA), project_stage, bin_stage, blend_stage, blend_backward_stage, project_backward_stage,
-    photometric_stage,       adam_stage,    calibrate,
+    photometric_stage,       adam_stage,    match_stage, calibrate,
 };
 
 }  // namespace gsopt::GSOPT_ISA

@@ -7,6 +7,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
@@ -216,6 +217,25 @@ void adam(Workspace& ws, Out param, In grad, Out exp_avg, Out exp_avg_sq, int64_
   timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
 }
 
+// What stays the same while planes are tried for the pixels of one picture.
+struct Windows {
+  In offsets, rays, windows, inverse_deviation;
+  float step_x, step_y, least_variance, unseen;
+};
+
+// A: 9 and T: 3 floats; costs and each third of `planes` have one element per ray.
+void match(Workspace& ws, const Windows& w, In corners, int height, int width, const std::vector<float>& A, const std::vector<float>& T, In planes, Out costs) {
+  const size_t padded = costs.size(), taps = w.offsets.size() / 2;
+  if (A.size() != 9 || T.size() != 3 || padded % 8 || width < 2 || height < 2) throw std::invalid_argument("match: wrong number of elements");
+  MatchArguments a = {static_cast<int64_t>(padded), static_cast<int>(taps), w.offsets.data(), data_of(w.rays, 2 * padded, "rays"),
+                      data_of(w.windows, 2 * taps * padded, "windows"), data_of(w.inverse_deviation, padded, "inverse_deviation"),
+                      data_of(planes, 3 * padded, "planes"), data_of(corners, 4 * static_cast<size_t>(height) * width, "corners"),
+                      width, height, {}, {}, w.step_x, w.step_y, w.least_variance, w.unseen, costs.data()};
+  std::copy(A.begin(), A.end(), a.A), std::copy(T.begin(), T.end(), a.T);
+  nb::gil_scoped_release release;
+  timed(ws, "match", [&] { ws.kernels->match(ws.pool, a); });
+}
+
 }  // namespace
 
 NB_MODULE(_cpu, m) {
@@ -256,6 +276,11 @@ NB_MODULE(_cpu, m) {
   m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg());
   m.def("photometric", &photometric);
   m.def("adam", &adam);
+  nb::class_<Windows>(m, "Windows")
+      .def("__init__", [](Windows* self, In offsets, In rays, In windows, In inverse_deviation, float step_x, float step_y, float least_variance, float unseen) {
+        new (self) Windows{offsets, rays, windows, inverse_deviation, step_x, step_y, least_variance, unseen};
+      });
+  m.def("match", &match);
 }
 
 }  // namespace gsopt

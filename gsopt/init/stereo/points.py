@@ -1,0 +1,112 @@
+"""The points that at least two photos of a scene agree on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gsopt.data.scene import Scene
+from gsopt.init.photos import Photo, small_photos
+from gsopt.init.rig import Focus, find_focus, inside, project
+from gsopt.init.stereo.matching import Matcher
+from gsopt.init.stereo.picture import Picture
+from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
+
+PHOTOS = 16
+"""Photos that are matched, the farthest apart."""
+SOURCES = 5
+"""Others that each is matched with, the nearest."""
+LEVELS = ((8_000, 8, 1.0), (32_000, 3, 0.02))
+"""Pixels, rounds, and first step of the search: where things are is found in small pictures, exactly in larger ones."""
+NEAR, FAR = 0.25, 50.0
+"""Depths that are searched, in distances to the focus."""
+SAME_DEPTH, SAME_PLACE, MATCHED, ANGLE = 0.02, 2.0, 0.4, 1.0
+"""Two photos agree on a point where their depths differ by less than this share, the pixel it comes back to is less
+than so many pixels away, both match no worse than this cost, and they see it from directions so many degrees apart: a
+camera that only turns says nothing of depth."""
+
+
+@dataclass(frozen=True)
+class StereoPoints:
+    """Places on surfaces, and their colours."""
+
+    xyz: Float[Tensor, "N 3"]
+    rgb: Float[Tensor, "N 3"]
+    """0..1."""
+    photos: int
+    """That were matched."""
+    share: float
+    """Of their pixels on which another photo agrees."""
+
+
+def stereo_points(scene: Scene, count: int, generator: torch.Generator) -> StereoPoints:
+    """Up to `count` of the places on which photos agree, drawn at random. Fewer than two photos agree on none."""
+    photos = small_photos(scene.train, PHOTOS)
+    focus = find_focus([view.camera for view in scene.train], scene.extent)
+    maps = plane_maps(photos, focus, generator) if len(photos) > 1 else []
+    kept = [agreed(each, [other for other in maps if other is not each]) for each in maps]
+    nothing = torch.empty(0, 3)
+    xyz = [each.picture.points(each.inverse_depths())[keep] for each, keep in zip(maps, kept, strict=True)]
+    rgb = [each.picture.rgb.permute(1, 2, 0)[keep] for each, keep in zip(maps, kept, strict=True)]
+    found = torch.cat([*xyz, nothing])
+    chosen = torch.randperm(len(found), generator=generator)[:count]
+    share = len(found) / max(1, sum(keep.numel() for keep in kept))
+    return StereoPoints(found[chosen], torch.cat([*rgb, nothing])[chosen], len(photos), share)
+
+
+def plane_maps(photos: Sequence[Photo], focus: Focus, generator: torch.Generator) -> list[PlaneMap]:
+    """The planes that the pixels of each photo show, whether others agree or not."""
+    reach = Reach(1 / (FAR * focus.distance), 1 / (NEAR * focus.distance))
+    maps: list[PlaneMap] = []
+    for pixels, rounds, shake in LEVELS:
+        pictures = [Picture.of(photo, pixels) for photo in photos]
+        starts = [
+            maps[index].enlarged(picture) if maps else random_planes(picture, reach, generator)
+            for index, picture in enumerate(pictures)
+        ]
+        maps = []
+        for picture, start in zip(pictures, starts, strict=True):
+            matcher = Matcher(picture, nearest(picture, pictures, focus), torch.get_num_threads())
+            maps.append(Search(picture, matcher, reach, start).run(rounds, shake, generator))
+    return maps
+
+
+def nearest(picture: Picture, pictures: Sequence[Picture], focus: Focus) -> list[Picture]:
+    """The others that most likely show the same: near in place and direction."""
+
+    def apart(other: Picture) -> float:
+        away = (other.camera.centers[0] - picture.camera.centers[0]).norm()
+        turned = 1 - (other.camera.forwards[0] * picture.camera.forwards[0]).sum()
+        return float(away + 2 * focus.distance * turned)
+
+    return sorted((other for other in pictures if other is not picture), key=apart)[:SOURCES]
+
+
+def agreed(here: PlaneMap, others: Sequence[PlaneMap]) -> Bool[Tensor, "H W"]:
+    """Pixels whose point another photo places there as well."""
+    column, row = here.picture.pixels
+    points = here.picture.points(here.inverse_depths()).view(-1, 3)
+    found = torch.zeros(len(points), dtype=torch.bool)
+    for other in others:
+        camera = other.picture.camera
+        there = project(camera, points)
+        rows = torch.nonzero(inside(camera, *there))[:, 0]
+        x, y = (there[0][rows].long().clamp(0, camera.width - 1), there[1][rows].long().clamp(0, camera.height - 1))
+        w = other.inverse_depths()
+        same_depth = (1 / w[y, x] / there[2][rows] - 1).abs() < SAME_DEPTH
+        back = project(here.picture.camera, other.picture.points(w)[y, x])
+        moved = torch.hypot(back[0] - column.flatten()[rows], back[1] - row.flatten()[rows])
+        matched = (moved < SAME_PLACE) & (other.costs[y, x] < MATCHED)
+        found[rows] |= same_depth & matched & (_angles(points[rows], here.picture, other.picture) > ANGLE)
+    return found.view(here.costs.shape) & (here.costs < MATCHED)
+
+
+def _angles(points: Float[Tensor, "N 3"], one: Picture, other: Picture) -> Float[Tensor, "N"]:
+    """Between the directions in which two cameras see points, degrees."""
+    a, b = points - one.camera.centers[0], points - other.camera.centers[0]
+    across = torch.linalg.cross(a, b).norm(dim=-1)
+    return torch.rad2deg(torch.atan2(across, (a * b).sum(-1)))

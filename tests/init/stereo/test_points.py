@@ -1,0 +1,101 @@
+"""Points from photos: they lie on what was photographed, or there are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import textured_room as room
+import torch
+from rooms import distance_to_the_room, room_scene
+
+from gsopt.config import InitConfig
+from gsopt.data.scene import Scene
+from gsopt.errors import UsageError
+from gsopt.init import first_gaussians
+from gsopt.init.stereo import StereoPoints, stereo_points
+
+COUNT = 4000
+
+
+def points_of(scene: Scene, seed: int = 0) -> StereoPoints:
+    return stereo_points(scene, COUNT, torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return room_scene(tmp_path_factory.mktemp("scene") / "room", room.arc(4))
+
+
+def test_points_lie_on_the_surfaces(scene: Scene) -> None:
+    """Some four units away, and a pixel of the matched pictures is two hundredths of a unit wide there."""
+    found = points_of(scene)
+    assert len(found.xyz) == COUNT
+    assert found.photos == 4
+    assert found.share > 0.5
+    distance = distance_to_the_room(found.xyz)
+    assert float(distance.median()) < 0.01
+    assert float(distance.quantile(0.95)) < 0.06
+
+
+def test_points_have_the_colors_of_the_photos(scene: Scene) -> None:
+    from gsopt.init.photos import mean_colors, small_photos
+
+    found = points_of(scene)
+    shown = mean_colors(small_photos(scene.train, 4), found.xyz)
+    assert float((shown - found.rgb).abs().mean()) < 0.08
+
+
+def test_the_same_bits_for_any_number_of_threads(scene: Scene) -> None:
+    before = torch.get_num_threads()
+    runs = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        runs.append(points_of(scene))
+    torch.set_num_threads(before)
+    assert torch.equal(runs[0].xyz, runs[1].xyz)
+    assert torch.equal(runs[0].rgb, runs[1].rgb)
+
+
+def test_photos_of_different_rooms_agree_on_next_to_nothing(tmp_path: Path) -> None:
+    strangers = points_of(room_scene(tmp_path / "rooms", room.arc(4), seeds=[0, 1, 2, 3]))
+    assert strangers.share < 0.05
+
+
+def test_a_camera_that_only_turns_says_nothing_of_depth(tmp_path: Path) -> None:
+    viewmats = room.arc(1).repeat(3, 1, 1)
+    for index, angle in enumerate((0.0, 0.1, -0.1)):
+        turn = torch.tensor(angle, dtype=torch.float64)
+        R = torch.eye(4, dtype=torch.float64)
+        R[0, 0], R[0, 2], R[2, 0], R[2, 2] = turn.cos(), turn.sin(), -turn.sin(), turn.cos()
+        viewmats[index] = R @ viewmats[index]
+    assert len(points_of(room_scene(tmp_path / "turned", viewmats)).xyz) == 0
+
+
+def test_one_photo_has_nothing_to_agree_with(scene: Scene) -> None:
+    assert len(points_of(replace(scene, train=scene.train[:1])).xyz) == 0
+
+
+def test_auto_takes_stereo_where_there_are_no_masks_and_says_so(scene: Scene) -> None:
+    gaussians, said = first_gaussians(scene, InitConfig(count=COUNT), 2, 0)
+    assert "stereo" in said
+    assert "\n" not in said
+    assert len(gaussians.validate()) == 2 * COUNT  # half of them at random
+    again, _ = first_gaussians(scene, InitConfig(count=COUNT), 2, 0)
+    assert torch.equal(gaussians.means, again.means)
+
+
+def test_photos_that_agree_on_nothing_start_at_random(tmp_path: Path) -> None:
+    strangers = room_scene(tmp_path / "rooms", room.arc(3), seeds=[0, 1, 2])
+    strangers = replace(strangers, train=strangers.train[:1])
+    _, said = first_gaussians(strangers, InitConfig(count=200), 2, 0)
+    assert "random points" in said
+    assert "agree on nothing" in said
+    with pytest.raises(UsageError, match="overlap"):
+        first_gaussians(strangers, InitConfig(method="stereo", count=200), 2, 0)
+
+
+def test_an_object_with_masks_can_ask_for_it(scene: Scene) -> None:
+    _, said = first_gaussians(replace(scene, has_alpha=True), InitConfig(method="stereo", count=200), 2, 0)
+    assert "as asked" in said
