@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gsopt import check
-from gsopt.cameras import Cameras
 from gsopt.config import InitConfig
-from gsopt.data.scene import Points, Scene
+from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
 from gsopt.gaussians import Gaussians
 from gsopt.init.frustum import random_points
@@ -25,67 +27,71 @@ ENOUGH_AGREED = 0.05
 FEW_PHOTOS = 10
 """So many find their depth better by stereo, more of them from random points (docs/decisions/0003-stereo.md)."""
 _COLOR_PHOTOS = 16
+Made = tuple[Gaussians, str]
+"""The Gaussians, and how they came about."""
 
 
-def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int) -> tuple[Gaussians, str]:
+def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int) -> Made:
     """The Gaussians a run starts from, and one line that says which method made them and why.
 
-    "auto": the scene's points when there are at least 100, else the visual hull when every input view has alpha and
-    the silhouettes agree, else with few views the places on which photos agree (stereo), else random. The same scene,
-    config and seed give the same bits. Raises UsageError when the method asked for does not fit the scene.
+    "auto" tries what `_worth_trying` lists. The same scene, config and seed give the same bits. Raises UsageError when
+    the method asked for does not fit the scene.
     """
     check.at_least("--init-count", config.count, 1, "Drop the flag for the default.")
     check.within("sh_degree", sh_degree, 0, 3, "Bands 0 to 3 are supported.")
     generator = torch.Generator().manual_seed(seed)
-    known = 0 if scene.points is None else len(scene.points.xyz)
-    if config.method == "points" or (config.method == "auto" and known >= ENOUGH_POINTS):
-        return _from_points(scene.points, sh_degree)
-    reason = f"the scene has {known} points, fewer than {ENOUGH_POINTS}, " if known else "the scene has no points "
     asked = config.method != "auto"
-    if config.method == "hull" or (not asked and scene.has_alpha):
-        found = _from_hull(scene, config.count, sh_degree, generator)
-        if found is not None:
-            why = "as asked" if asked else f"because {reason}and every view has alpha"
-            return found[0], f"visual hull of {found[1]}, {why}"
+    known = 0 if scene.points is None else len(scene.points.xyz)
+    reason = (
+        f"the scene has {known or 'no'} points and {'every view has' if scene.has_alpha else 'its views have no'} alpha"
+    )
+    why = "as asked" if asked else "because {}"
+    for method in _worth_trying(scene, known, config):
+        made = METHODS[method](scene, config.count, sh_degree, generator)
+        if made is not None:
+            return made[0], f"{made[1]}, {why.format(reason)}"
         if asked:
-            raise UsageError(
-                "`--init hull` needs alpha or masks that outline one object in every input view; these do not "
-                "agree on any. Check the masks, or take `--init random`."
-            )
-    reason += "and its silhouettes enclose nothing" if scene.has_alpha else "and its views have no alpha"
-    if config.method == "stereo" or (not asked and len(scene.train) <= FEW_PHOTOS):
-        found = _from_stereo(scene, config.count, sh_degree, generator)
-        if found is not None:
-            return found[0], f"{found[1]}, {'as asked' if asked else f'because {reason}'}"
-        if asked:
-            raise UsageError(
-                "`--init stereo` needs photos that overlap; too few of these show the same. Add photos between "
-                "them, check the poses, or take `--init random`."
-            )
-        reason += ", and its photos agree on nothing"
-    gaussians = _random(scene, config.count, sh_degree, generator)
-    why = "as asked" if asked else f"because {reason}"
-    return gaussians, f"{len(gaussians):,} random points where the cameras look, {why}"
+            raise UsageError(MISFITS[method])
+        reason += WITHOUT_SUCCESS[method]
+    xyz, rgb = _random_points(scene, config.count, generator)
+    return gaussians_at(xyz, rgb, sh_degree), f"{len(xyz):,} random points where the cameras look, {why.format(reason)}"
 
 
-def _from_points(points: Points | None, sh_degree: int) -> tuple[Gaussians, str]:
+def _worth_trying(scene: Scene, known: int, config: InitConfig) -> list[str]:
+    """Methods before random points, best first: of few photos that show all of a scene those places on which they
+    agree, unless the scene has as many points; else its points; the visual hull of what is masked."""
+    if config.method != "auto":
+        return [config.method] if config.method in METHODS else []
+    few = len(scene.train) <= FEW_PHOTOS
+    wanted = [
+        ("stereo", few and not scene.has_alpha and known < config.count),
+        ("points", known >= ENOUGH_POINTS),
+        ("hull", scene.has_alpha),
+        ("stereo", few and scene.has_alpha),  # alpha that hides nothing
+    ]
+    return [method for method, worth in wanted if worth]
+
+
+def _from_points(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+    points = scene.points
     if points is None or len(points.xyz) == 0:
-        raise UsageError("`--init points` needs a scene with points; it has none. Take `auto` instead.")
+        return None
     gaussians = gaussians_at(points.xyz, points.rgb.float() / 255, sh_degree)
     return gaussians, f"{len(gaussians):,} points that came with the scene"
 
 
-def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> tuple[Gaussians, str] | None:
-    if not scene.has_alpha:
-        return None
-    found = hull_points(scene, count, generator)
+def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+    found = hull_points(scene, count, generator) if scene.has_alpha else None
     if found is None:
         return None
     gaussians = gaussians_at(found.xyz, found.rgb, sh_degree)
-    return gaussians, f"{found.silhouettes} silhouettes, {len(gaussians):,} points, voxel {found.voxel:.3g}"
+    return (
+        gaussians,
+        f"visual hull of {found.silhouettes} silhouettes, {len(gaussians):,} points, voxel {found.voxel:.3g}",
+    )
 
 
-def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> tuple[Gaussians, str] | None:
+def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
     found = stereo_points(scene, count, generator)
     if found.share < ENOUGH_AGREED:
         return None
@@ -97,17 +103,30 @@ def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Gene
     return gaussians, f"{len(found.xyz):,} points by stereo ({agreed}) and {len(xyz):,} at random"
 
 
-def _random(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Gaussians:
-    xyz, rgb = _random_points(scene, count, generator)
-    return gaussians_at(xyz, rgb, sh_degree)
-
-
-def _random_points(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Places and colours."""
-    cameras: list[Cameras] = [view.camera for view in scene.train]
+def _random_points(
+    scene: Scene, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Places and colours (0..1)."""
+    cameras = [view.camera for view in scene.train]
     focus = find_focus(cameras, scene.extent)
     xyz = random_points(cameras, focus, count, not scene.has_alpha, generator)
     if scene.has_alpha:
         # Most points lie beside the object: in its colours they stay there as fog (lego, 8 views: -11 dB).
         return xyz, torch.full((len(xyz), 3), 0.5)
     return xyz, mean_colors(small_photos(scene.train, _COLOR_PHOTOS), xyz)
+
+
+METHODS: dict[str, Callable[[Scene, int, int, torch.Generator], Made | None]] = {
+    "points": _from_points,
+    "hull": _from_hull,
+    "stereo": _from_stereo,
+}
+"""Of a scene, how many, the highest SH band and a generator; None where a method does not fit the scene."""
+MISFITS = {
+    "points": "`--init points` needs a scene with points; it has none. Take `auto` instead.",
+    "hull": "`--init hull` needs alpha or masks that outline one object in every input view; these do not agree on "
+    "any. Check the masks, or take `--init random`.",
+    "stereo": "`--init stereo` needs photos that overlap; too few of these show the same. Add photos between them, "
+    "check the poses, or take `--init random`.",
+}
+WITHOUT_SUCCESS = {"hull": ", and its silhouettes enclose nothing", "stereo": ", and its photos agree on nothing"}
