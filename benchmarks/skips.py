@@ -4,10 +4,11 @@
 
 DATA holds `nerf_synthetic_lego_400` and `fox`. Arms of each scene: `plain` (every skip off but the kernels' own),
 `bare` (those off as well), `all` (every skip on), `free` (beside the kernels' own only those whose row says no more
-than 0.1 dB on either scene) and `no-X` (every skip but X). An arm is one `gsopt train --threads 1` in a process of its own; its CPU time (user and
-system, all threads, over the training steps alone) and its held-out metrics go to benchmarks/results/skips.json. Arms
-that have a record are not measured again, an arm that was cut short goes on from its last checkpoint, and a skip that
-acts late forks from the checkpoint of `all` at step 4000. --draw writes the table without measuring.
+than 0.1 dB on either scene) and `no-X` (every skip but X). An arm is one `gsopt train --threads 1` in a process of its
+own; its CPU time (user and system, all threads, over the training steps alone) and its held-out metrics go to
+benchmarks/results/skips.json. Arms that have a record are not measured again, an arm that was cut short goes on from
+its last checkpoint, and a skip that acts late forks from the checkpoint of `all` at step 4000. --draw writes the table
+without measuring.
 """
 
 from __future__ import annotations
