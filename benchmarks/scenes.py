@@ -31,6 +31,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "lego-8": (LEGO, EIGHT),
     "lego-8-plain-3dgs": (LEGO, [*EIGHT, *PLAIN]),
     "fox-quarter": (FOX, ["-r", "4", "--eval"]),
+    "fox-quarter-8": (FOX, ["-r", "4", "--eval", "--views", "8"]),
 }
 KEPT = ("mean", "per_view", "train_seconds", "peak_memory_mb", "n_gaussians", "protocol", "versions", "config")
 
