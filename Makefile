@@ -41,7 +41,7 @@ bench: $(VENV)/.for-test
 stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
-# The rasterizer's tests on a build that stops at the first bad address or undefined behavior. -S and -P: neither the
+# The tests of the kernels on a build that stops at the first bad address or undefined behavior. -S and -P: neither the
 # editable install nor the sources are to be imported instead of it.
 sanitize: $(VENV)/.for-test
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
@@ -50,7 +50,7 @@ sanitize: $(VENV)/.for-test
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 \
 	  PYTHONPATH="build/sanitized:$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"; \
 	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
-	$(PY) -S -P -m pytest tests/raster
+	$(PY) -S -P -m pytest tests/raster tests/init/stereo/test_matching.py
 
 # A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 5 GB of memory.
 test-sd21: $(VENV)/.for-test
