@@ -95,9 +95,8 @@ def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Gene
     found = stereo_points(scene, count, generator)
     if found.share < ENOUGH_AGREED:
         return None
-    xyz, rgb = _random_points(
-        scene, count, generator
-    )  # where only one photo looks, or none agree, something must start
+    # Something must start where only one photo looks, or none agree.
+    xyz, rgb = _random_points(scene, count, generator)
     gaussians = gaussians_at(torch.cat([found.xyz, xyz]), torch.cat([found.rgb, rgb]), sh_degree)
     agreed = f"{found.photos} photos agree on {found.share:.0%} of their pixels"
     return gaussians, f"{len(found.xyz):,} points by stereo ({agreed}) and {len(xyz):,} at random"

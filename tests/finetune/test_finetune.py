@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,10 +52,11 @@ def pairs(scenes: Path) -> Pairs:
 
 
 @pytest.fixture(scope="module")
-def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     out = tmp_path_factory.mktemp("priors") / "mine"
     assert main([*command(scenes, out)]) == 0
-    return out
+    yield out
+    shutil.rmtree(out)  # 200 MB: the optimiser's state of every weight
 
 
 def command(scenes: Path, out: Path, *more: str) -> list[str]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -49,10 +51,11 @@ def command(scenes: Path, out: Path, *more: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     out = tmp_path_factory.mktemp("priors") / "told"
     assert main(command(scenes, out)) == 0
-    return out
+    yield out
+    shutil.rmtree(out)  # 200 MB: the optimiser's state of every weight
 
 
 def test_a_scene_is_described_by_what_lies_beside_it(scenes: Path, tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gsopt.init.stereo.picture import Picture
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
-from gsopt.raster.cpu_backend import workspace
 
 RADIUS, STRIDE = 2, 2
 """A window is 5 x 5 taps, two pixels apart."""
@@ -33,10 +32,10 @@ TAPS = [(float(dx), float(dy)) for dy in _STEPS for dx in _STEPS]
 
 
 class Matcher:
-    """The windows of one picture against `sources`; `threads` as for `workspace`."""
+    """The windows of one picture against `sources`; `workspace` as `cpu_backend.workspace` makes it."""
 
-    def __init__(self, reference: Picture, sources: Sequence[Picture], threads: int = 0) -> None:
-        self._workspace = workspace(threads)
+    def __init__(self, reference: Picture, sources: Sequence[Picture], workspace: Any) -> None:
+        self._workspace = workspace
         self._shape = (reference.camera.height, reference.camera.width)
         K = reference.camera.Ks[0]
         weights, centered = windows(reference.gray)

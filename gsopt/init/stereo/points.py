@@ -15,6 +15,7 @@ from gsopt.init.rig import Focus, find_focus, inside, project
 from gsopt.init.stereo.matching import Matcher
 from gsopt.init.stereo.picture import Picture
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
+from gsopt.raster.cpu_backend import workspace
 
 PHOTOS = 16
 """Photos that are matched, the farthest apart."""
@@ -61,6 +62,7 @@ def stereo_points(scene: Scene, count: int, generator: torch.Generator) -> Stere
 def plane_maps(photos: Sequence[Photo], focus: Focus, generator: torch.Generator) -> list[PlaneMap]:
     """The planes that the pixels of each photo show, whether others agree or not."""
     reach = Reach(1 / (FAR * focus.distance), 1 / (NEAR * focus.distance))
+    threads = workspace(torch.get_num_threads())
     maps: list[PlaneMap] = []
     for pixels, rounds, shake in LEVELS:
         pictures = [Picture.of(photo, pixels) for photo in photos]
@@ -70,7 +72,7 @@ def plane_maps(photos: Sequence[Photo], focus: Focus, generator: torch.Generator
         ]
         maps = []
         for picture, start in zip(pictures, starts, strict=True):
-            matcher = Matcher(picture, nearest(picture, pictures, focus), torch.get_num_threads())
+            matcher = Matcher(picture, nearest(picture, pictures, focus), threads)
             maps.append(Search(picture, matcher, reach, start).run(rounds, shake, generator))
     return maps
 

@@ -13,7 +13,7 @@ from gsopt.cameras import Cameras
 from gsopt.init.stereo.matching import LEAST_VARIANCE, TAPS, UNSEEN, Matcher, windows
 from gsopt.init.stereo.picture import Picture
 from gsopt.raster import _cpu
-from gsopt.raster.cpu_backend import ISA_VARIABLE
+from gsopt.raster.cpu_backend import ISA_VARIABLE, workspace
 
 COST = 2e-4
 """A correlation of float32 numbers whose variance may be as small as LEAST_VARIANCE: mean square less squared mean
@@ -81,7 +81,7 @@ def test_costs_are_those_of_float64(isa: str, seed: int) -> None:
     planes[2] += 0.3
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(ISA_VARIABLE, isa)
-        (cost,) = Matcher(reference, [source], 1).costs(planes)
+        (cost,) = Matcher(reference, [source], workspace(1)).costs(planes)
     wanted, slack = plain_costs(reference, source, planes.double())
     decided = slack.abs() > BORDER
     assert float(decided.double().mean()) > 0.98
@@ -101,7 +101,7 @@ def test_a_picture_matches_itself_and_not_its_negative() -> None:
     one = picture(5, torch.eye(4))
     negative = Picture(one.camera, 1 - one.rgb)
     planes = torch.ones(3, *one.gray.shape)
-    same, opposite = Matcher(one, [one, negative], 1).costs(planes)
+    same, opposite = Matcher(one, [one, negative], workspace(1)).costs(planes)
     seen = same < UNSEEN
     textured = windows(one.gray)[1].square().mean(0) > 1e-3
     assert bool((seen & textured).any())
@@ -111,7 +111,7 @@ def test_a_picture_matches_itself_and_not_its_negative() -> None:
 
 def test_what_shows_nothing_matches_nothing() -> None:
     blank = Picture(picture(1, torch.eye(4)).camera, torch.full((3, 30, 40), 0.4))
-    (cost,) = Matcher(blank, [blank], 1).costs(torch.ones(3, 30, 40))
+    (cost,) = Matcher(blank, [blank], workspace(1)).costs(torch.ones(3, 30, 40))
     assert float((cost[cost < UNSEEN] - 1).abs().max()) < 0.05
 
 
@@ -119,7 +119,7 @@ def test_planes_that_are_not_numbers_or_lie_behind_are_unseen() -> None:
     one = picture(2, torch.eye(4))
     for value in (float("nan"), float("inf"), -float("inf")):
         planes = torch.full((3, 30, 40), value)
-        (cost,) = Matcher(one, [picture(2, moved(2))], 1).costs(planes)
+        (cost,) = Matcher(one, [picture(2, moved(2))], workspace(1)).costs(planes)
         assert bool((cost == UNSEEN).all())
 
 
@@ -134,7 +134,7 @@ def test_the_rooms_own_floor_matches_better_than_another(tmp_path) -> None:
     # The floor z = 0 seen from the camera: depth * (Rᵀ ray)_z + center_z = 0.
     floor = [(-R[k, 2] / center[2]).item() for k in range(3)]
     planes = torch.tensor(floor)[:, None, None].expand(3, *first.gray.shape)
-    true, wrong = (Matcher(first, [second], 1).costs(scale * planes)[0] for scale in (1.0, 1.1))
+    true, wrong = (Matcher(first, [second], workspace(1)).costs(scale * planes)[0] for scale in (1.0, 1.1))
     bottom = first.gray.shape[0] * 3 // 4  # the last rows show only the floor
     assert float(true[bottom:].median()) < 0.15
     assert float(wrong[bottom:].median()) > 0.5
