@@ -161,7 +161,7 @@ def measure(case: Case, threads: int, repetitions: int, rates: dict[str, dict[st
     }
 
 
-LANES = {"avx512": 16, "avx2": 8, "portable": 8, "neon": 8}
+LANES = {"avx512": 16, "avx2x2": 16, "avx2": 8, "portable": 8, "neon": 8}
 """Pixels of a block, which is the width of a vector of the kernels."""
 
 

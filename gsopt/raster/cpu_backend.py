@@ -21,7 +21,7 @@ ISA_VARIABLE = "GSOPT_ISA"
 
 def workspace(threads: int = 0) -> Any:
     """What kernels run in: a pool of `threads` (0: one per core) and an instruction set, the best one or that which
-    the environment variable GSOPT_ISA (avx512, avx2, portable) names; UsageError if this processor lacks it."""
+    the environment variable GSOPT_ISA (avx512, avx2, avx2x2, portable) names; UsageError if this processor lacks it."""
     try:
         return _cpu.Workspace(threads or _available_cores(), os.environ.get(ISA_VARIABLE, ""))
     except ValueError as error:

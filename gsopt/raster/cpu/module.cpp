@@ -30,6 +30,7 @@ namespace avx512 { extern const Kernels kernels; }
 #endif
 #if defined(GSOPT_HAVE_AVX2)
 namespace avx2 { extern const Kernels kernels; }
+namespace avx2x2 { extern const Kernels kernels; }
 #endif
 namespace portable { extern const Kernels kernels; }
 
@@ -48,7 +49,10 @@ std::vector<const Kernels*> available_kernels() {
     found.push_back(&avx512::kernels);
 #endif
 #if defined(GSOPT_HAVE_AVX2)
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&avx2::kernels);
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
+    found.push_back(&avx2::kernels);
+    found.push_back(&avx2x2::kernels);
+  }
 #endif
   found.push_back(&portable::kernels);
   return found;

@@ -1,5 +1,5 @@
-// Vectors of 4, 8 and, with AVX-512, 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the
-// language has no operator. 8 lanes hold Gaussians; 8 or 16 hold the pixels of a block.
+// Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the language has no
+// operator. 8 lanes hold Gaussians; 8, or with GSOPT_SIXTEEN 16, hold the pixels of a block.
 // Included once per instruction set; everything lives in that set's own namespace.
 #pragma once
 #include <cmath>
@@ -85,35 +85,45 @@ inline float sum(f8 a) {
 
 inline i8 shift_exponent(i8 n) { return n << 23; }
 
-#if defined(__AVX512F__)
+#if defined(GSOPT_SIXTEEN)
 using f16 = float __attribute__((vector_size(64)));
 using i16 = int32_t __attribute__((vector_size(64)));
 using f16u = float __attribute__((vector_size(64), aligned(4), may_alias));
 using i16u = int32_t __attribute__((vector_size(64), aligned(4), may_alias));
 template <> inline f16 splat<f16>(float x) { return f16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+inline i16 splat16i(int32_t x) { return i16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
 inline i16 bits(f16 v) { return (i16)v; }
 inline f16 from_bits(i16 v) { return (f16)v; }
 inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
 inline i16 both(i16 m, i16 n) { return m & n; }
+inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
+inline i16 shift_exponent(i16 n) { return n << 23; }
+inline f8 low_half(f16 a) { return __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7); }
+inline f8 high_half(f16 a) { return __builtin_shufflevector(a, a, 8, 9, 10, 11, 12, 13, 14, 15); }
+inline f8 fold(f16 a) { return low_half(a) + high_half(a); }
+inline float sum(f16 a) { return sum(fold(a)); }
+#if defined(__AVX512F__)
 inline f16 min(f16 a, f16 b) { return (f16)_mm512_min_ps((__m512)a, (__m512)b); }
 inline i16 max(i16 a, i16 b) { return (i16)_mm512_max_epi32((__m512i)a, (__m512i)b); }
-inline f16 abs(f16 a) { return (f16)_mm512_abs_ps((__m512)a); }
 inline int movemask(i16 m) { return _mm512_movepi32_mask((__m512i)m); }
+#else
+inline f16 joined(f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
+inline f16 min(f16 a, f16 b) { return joined(min(low_half(a), low_half(b)), min(high_half(a), high_half(b))); }
+inline i16 max(i16 a, i16 b) { return a > b ? a : b; }
+inline int movemask(i16 m) { return movemask((i8)low_half((f16)m)) | movemask((i8)high_half((f16)m)) << 8; }
+#endif
 inline bool any(i16 m) { return movemask(m) != 0; }
-inline float sum(f16 a) { return _mm512_reduce_add_ps((__m512)a); }
-inline i16 shift_exponent(i16 n) { return n << 23; }
 #endif
 
-// The pixels of a block, one per lane: 4x4 in one register of AVX-512, else 4x2 in one of 8 lanes.
-// Masks are integers, all ones where true.
-#if defined(__AVX512F__)
+// The pixels of a block, one per lane: 4x4 in 16 lanes, 4x2 in 8. Masks are integers, all ones where true.
+#if defined(GSOPT_SIXTEEN)
 using px = f16;
 using pxi = i16;
 inline px load_px(const float* p) { return *reinterpret_cast<const f16u*>(p); }
 inline void store_px(float* p, px v) { *reinterpret_cast<f16u*>(p) = v; }
 inline pxi load_pxi(const int32_t* p) { return *reinterpret_cast<const i16u*>(p); }
 inline void store_pxi(int32_t* p, pxi v) { *reinterpret_cast<i16u*>(p) = v; }
-inline pxi splat_pxi(int32_t x) { return pxi{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+inline pxi splat_pxi(int32_t x) { return splat16i(x); }
 #else
 using px = f8;
 using pxi = i8;
@@ -175,9 +185,6 @@ inline void transpose8(f8 r[8]) {
 }
 
 inline f8 fold(f8 a) { return a; }
-#if defined(__AVX512F__)
-inline f8 fold(f16 a) { return (f8)_mm512_castps512_ps256((__m512)a) + (f8)_mm512_extractf32x8_ps((__m512)a, 1); }
-#endif
 
 // The sums of the lanes of eight vectors, in one.
 inline f8 sums(px a, px b, px c, px d, px e, px f, px g, px h) {
