@@ -63,8 +63,8 @@ class InitConfig:
     """The first Gaussians."""
 
     method: Literal["auto", "points", "hull", "stereo", "random"] = "auto"
-    """auto: SfM points when there are enough, else the visual hull when there is alpha, else with few photos the
-    places on which they agree (stereo), else random in the frustum."""
+    """auto: of few photos without alpha the places on which they agree (stereo), unless as many SfM points are known;
+    else SfM points when there are enough, else the visual hull when there is alpha, else random in the frustum."""
     count: int = 20_000
     """How many to make; stereo adds as many at random."""
 

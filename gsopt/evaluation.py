@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from gsopt import __version__
+from gsopt.data.refined import with_refined_poses
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
@@ -107,11 +108,12 @@ def evaluate(
     """Judge a finished run by its held-out views and write metrics.json; other fields in there are kept.
 
     `scene` saves loading it again. With nothing held out `mean` is null, `reason` says why, and some input views are
-    judged under `train`. Renders go to RUN/renders/{test,train}. Raises InputError when run or data cannot be read.
+    judged under `train`, where the run put them if it refined poses. Renders go to RUN/renders/{test,train}. Raises
+    InputError when run or data cannot be read.
     """
     finished = open_run(Path(run), backend, threads)
     kept = read_metrics(finished.path)  # before the work: a broken file is not to be replaced
-    scene = scene or load_scene(finished.config.data)
+    scene = with_refined_poses(scene or load_scene(finished.config.data), finished.path)
     results = _results(finished, scene, vgg, on_view)
     document = {**kept, **_about(finished), **results, "protocol": _protocol(finished, scene, results)}
     write_atomic(finished.path / "metrics.json", to_json(document))

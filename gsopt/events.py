@@ -40,7 +40,12 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 def to_json(value: Any) -> bytes:
     """Readable, strict JSON (NaN is refused) with a final newline."""
-    return (json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode()
+    return _encoded(json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def _encoded(text: str) -> bytes:
+    """UTF-8; of file names that are none, the bytes that are no text as the escapes JSON has for them."""
+    return text.encode("utf-8", "backslashreplace")
 
 
 class EventWriter:
@@ -64,7 +69,7 @@ class EventWriter:
     def emit(self, kind: str, **fields: Any) -> dict[str, Any]:
         """One line, one write; returns the event."""
         event = {"v": VERSION, "seq": self._seq, "kind": kind, "time": round(time.time(), 3), **fields}
-        os.write(self._fd, (json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n").encode())
+        os.write(self._fd, _encoded(json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n"))
         self._seq += 1
         return event
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsopt.camera_paths import ellipse_path, interpolated_path, orbit_path, turntable_path
 from gsopt.cameras import Cameras
 from gsopt.config import TrainConfig
+from gsopt.data.refined import with_refined_poses
 from gsopt.data.resample import premultiply
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
@@ -93,7 +94,7 @@ def shots_along(run: FinishedRun, path: str, count: int, longest: int | None = N
 
     `longest`: scale so that the longer side has this many px. Raises InputError when nothing was held out.
     """
-    scene = load_scene(run.config.data)
+    scene = with_refined_poses(load_scene(run.config.data), run.path)
     if path in ("train", "test"):
         views = scene.train if path == "train" else scene.test
         if not views:

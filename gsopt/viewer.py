@@ -19,7 +19,7 @@ from gsopt._optional import require
 from gsopt.cameras import Cameras
 from gsopt.config import TrainConfig
 from gsopt.data.scene import load_scene
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 from gsopt.events import LAST, read_events
 from gsopt.formats import load_splats
 from gsopt.gaussians import Gaussians
@@ -182,7 +182,7 @@ def cameras_or_notice(run: Path) -> tuple[list[Cameras], str]:
     """The input cameras, or none and the reason: a run stays viewable when its photos have moved."""
     try:
         return input_cameras(run), ""
-    except InputError as error:
+    except (InputError, UsageError) as error:
         return [], f"no input cameras: {error}"
 
 

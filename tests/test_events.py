@@ -107,3 +107,13 @@ def test_a_folder_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> No
         write_atomic(tmp_path / "file" / "metrics.json", b"{}")
     with pytest.raises(InputError, match="Cannot write"):
         EventWriter(tmp_path / "absent")
+
+
+def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:
+    """File systems have names that are not UTF-8; Python holds their bytes as lone surrogates."""
+    name = "caf\udce9.jpg"
+    assert json.loads(to_json({"name": name})) == {"name": name}
+    writer = EventWriter(tmp_path)
+    writer.emit("warning", message=name)
+    writer.close()
+    assert read_events(tmp_path / "events.jsonl")[0][0]["message"] == name

@@ -51,7 +51,7 @@ def test_a_film_goes_where_it_is_told(run: Path, tmp_path: Path) -> None:
 
 def test_frames_go_to_the_run_when_nothing_is_said_and_are_not_written_over(run: Path) -> None:
     assert cli_render.main([str(run), "--path", "train"]) == 0
-    first = run / "renders" / "train" / "0000_r_0.png"
+    first = run / "frames" / "train" / "0000_r_0.png"
     assert Image.open(first).size == (WIDTH, HEIGHT)
     with pytest.raises(UsageError, match="--overwrite"):
         cli_render.main([str(run), "--path", "train"])

@@ -82,7 +82,9 @@ class RunConsole:
         """Append to log.txt, unless that is where stdout goes anyway. A log that cannot be written stops nothing."""
         try:
             if self._log is None:
-                self._log = open(self._run / "log.txt", "a", encoding="utf-8")  # noqa: SIM115 (open as long as the run)
+                self._log = open(  # noqa: SIM115 (open as long as the run)
+                    self._run / "log.txt", "a", encoding="utf-8", errors="backslashreplace"
+                )
             if not _is_stdout(self._log):
                 self._log.write(line + "\n")
                 self._log.flush()

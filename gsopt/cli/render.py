@@ -22,7 +22,7 @@ class Flags:
     """train and test: those views; orbit and ellipse: around the subject; turntable: the orbit, or a swing where the
     cameras stood on one side only; interpolated: through the input views in their order."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """A folder for PNG frames, or a film that ends in .mp4, .webp or .gif. RUN/renders/PATH when not given."""
+    """A folder for PNG frames, or a film that ends in .mp4, .webp or .gif. RUN/frames/PATH when not given."""
     frames: int = 120
     """Frames on the other paths."""
     fps: float = 24.0
@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
 
     run = open_run(flags.run, flags.backend, flags.threads)
     shots = shots_along(run, flags.path, flags.frames, flags.size)
-    output = flags.output or flags.run / "renders" / flags.path
+    output = flags.output or flags.run / "frames" / flags.path
     if output.suffix.lower() in FILMS:
         render_film(run, shots, output, flags.fps, overwrite=flags.overwrite)
     else:

@@ -272,19 +272,26 @@ def absolute(name: str) -> str:
 
 def recorded_config(flags: Flags, run: Path) -> settings.TrainConfig:
     """The settings a run was started with; flags that would change them are refused."""
-    default = Flags()
-    for name in (item.name for item in dataclasses.fields(Flags) if item.name not in WITH_RESUME):
-        if getattr(flags, name) != getattr(default, name):
-            raise UsageError(
-                f"`--{name.replace('_', '-')}` was given with --resume, which takes all settings from "
-                f"{run / 'config.json'}. Drop the flag, or give DATA and all flags of the run again."
-            )
-    return replace(
-        settings.TrainConfig.read(run / "config.json"),
-        threads=flags.threads,
-        checkpoint_every=flags.checkpoint_every,
-        preview_every=flags.preview_every,
-    )
+    given = changed(flags, Flags())
+    if refused := [name for name in given if name not in WITH_RESUME]:
+        raise UsageError(
+            f"`{refused[0]}` was given with --resume, which takes all settings from {run / 'config.json'}. Drop what "
+            "is given there, or give DATA and all flags of the run again."
+        )
+    free = {name: getattr(flags, name) for name in ("threads", "checkpoint_every", "preview_every") if name in given}
+    return replace(settings.TrainConfig.read(run / "config.json"), **free)
+
+
+def changed(flags: Any, default: Any, within: str = "") -> list[str]:
+    """The settings that differ, those of a part named after it: density.strategy."""
+    names: list[str] = []
+    for item in dataclasses.fields(flags):
+        one, other = getattr(flags, item.name), getattr(default, item.name)
+        if dataclasses.is_dataclass(one):
+            names += changed(one, other, f"{within}{item.name}.")
+        elif one != other:
+            names.append(f"{within}{item.name}")
+    return names
 
 
 def read_ids(text: str) -> tuple[int, ...]:

@@ -165,9 +165,12 @@ def _has_alpha(image: Image.Image) -> bool:
 
 def _decode(image: Image.Image, mode: str, path: Path) -> UInt8[Tensor, "H W C"]:
     try:
+        if image.mode == "F":
+            raise ValueError("its pixels are floating-point numbers, of which nobody knows the range; 8 bit are read")
         if image.mode.startswith("I"):  # 16-bit grey: Pillow would clip it to 255 instead of scaling
-            high = np.clip(np.asarray(image, dtype=np.int64) >> 8, 0, 255).astype(np.uint8)
-            image = Image.fromarray(high)
+            wide = np.asarray(image, dtype=np.int64)
+            few = mode == "L" and wide.max() <= 255  # a mask of 0 and 1, or of 0 and 255
+            image = Image.fromarray(np.clip(wide >> (0 if few else 8), 0, 255).astype(np.uint8))
         array = np.array(image.convert(mode))
     except Exception as error:
         raise _undecodable(path, error) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +22,23 @@ def read_points_ply(path: Path) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 
     _check_counts(path)
     try:
         vertices = PlyData.read(str(path), mmap=False)["vertex"].data
-        xyz = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (PlyParseError, KeyError, OSError, ValueError, IndexError, MemoryError) as error:
+        xyz = _columns(vertices, "xyz")
+        colored = {"red", "green", "blue"} <= set(vertices.dtype.names or ())
+        columns = _columns(vertices, ("red", "green", "blue")) if colored else None
+    except (PlyParseError, KeyError, OSError, ValueError, TypeError, IndexError, MemoryError) as error:
         raise InputError(f"Cannot read the points {path}: {error}. Export them again, or remove the file.") from error
     rgb = np.full(xyz.shape, 128, dtype=np.uint8)
     kept = np.isfinite(xyz).all(axis=1)
-    if {"red", "green", "blue"} <= set(vertices.dtype.names or ()):
-        columns = np.stack([np.asarray(vertices[name], dtype=np.float64) for name in ("red", "green", "blue")], axis=1)
+    if columns is not None:
         scale = 1 if vertices["red"].dtype.kind in "iu" else 255
         kept &= np.isfinite(columns).all(axis=1)
         rgb[kept] = np.clip(columns[kept] * scale, 0, 255).astype(np.uint8)
     return torch.from_numpy(xyz[kept]), torch.from_numpy(rgb[kept])
+
+
+def _columns(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
+    """Properties side by side; ValueError or TypeError for one that is a list."""
+    return np.stack([np.asarray(vertices[name], dtype=np.float64) for name in names], axis=1)
 
 
 def _check_counts(path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
@@ -63,6 +64,21 @@ def check_pose(matrix: Float[Tensor, "4 4"], where: str) -> None:
     bottom = matrix[3].tolist()
     if max(abs(a - b) for a, b in zip(bottom, (0, 0, 0, 1), strict=True)) > RIGID_TOLERANCE:
         raise InputError(f"The pose of {where} is not rigid: its last row is {bottom}, not 0 0 0 1. {remedy}")
+
+
+def read_pose(record: dict[str, Any], key: str, where: str) -> Float[Tensor, "4 4"]:
+    """The matrix of 3 or 4 rows under a JSON record's `key`, checked to be finite and rigid; float64."""
+    matrix = record.get(key)
+    rows = matrix if isinstance(matrix, list) else []
+    if len(rows) not in (3, 4) or any(not isinstance(row, list) or len(row) != 4 for row in rows):
+        raise InputError(f"`{key}` of {where} must be 4 rows of 4 numbers. Correct or remove that frame.")
+    try:
+        values = [[float(value) for value in row] for row in rows]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"`{key}` of {where} must hold numbers: {error}. Correct that frame.") from error
+    pose = torch.tensor([*values, [0.0, 0.0, 0.0, 1.0]][:4], dtype=torch.float64)
+    check_pose(pose, where)
+    return pose
 
 
 def check_enough(frames: list[Frame], absent: list[str], path: Path) -> None:

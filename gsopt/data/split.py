@@ -21,7 +21,7 @@ def split(source: Source, config: DataConfig) -> tuple[list[Frame], list[Frame]]
         test = by_name[::HOLD_OUT_EVERY] if config.eval else []
         held_out = {id(frame) for frame in test}
         train = [frame for frame in train if id(frame) not in held_out]
-    return _chosen(train, config, source.kind), test
+    return _chosen(train, config, source.kind) if train else [], test
 
 
 def _chosen(train: list[Frame], config: DataConfig, kind: str) -> list[Frame]:

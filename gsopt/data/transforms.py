@@ -19,7 +19,7 @@ from gsopt.data.images import read_header
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
 from gsopt.data.pointcloud import read_points_ply
-from gsopt.data.source import Frame, Source, check_enough, check_pose, summarize_names
+from gsopt.data.source import Frame, Source, check_enough, read_pose, summarize_names
 from gsopt.errors import InputError
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG")
@@ -38,7 +38,7 @@ def read_transforms(root: Path) -> Source:
     held_out: list[Frame] | None = None
     for name in ("transforms_test.json", "transforms_val.json"):
         if held_out is None and files.is_regular(root / name):
-            held_out, _ = read_frames(files.read_json(root / name), root / name, warnings)
+            held_out = read_frames(files.read_json(root / name), root / name, warnings)[0] or None
     if held_out is None and isinstance(document.get("test_filenames"), list):
         held_out, frames = _pick_test(frames, document, root)
     if not synthetic:
@@ -101,7 +101,7 @@ def _frame(
         name=files.relative_name(image, path.parent),
         path=image,
         mask=mask,
-        viewmat=viewmats_from_opengl(_pose(entry.get("transform_matrix"), where)),
+        viewmat=viewmats_from_opengl(read_pose(entry, "transform_matrix", where)),
         K=_intrinsics(values, width, height, where),
         width=width,
         height=height,
@@ -114,20 +114,6 @@ def _inside_images(file_path: str, image: Path) -> str:
     """The image's name below `images/`, as mask folders mirror it."""
     parts = Path(file_path.replace("\\", "/")).parent.parts
     return Path(*parts[1:], image.name).as_posix() if parts and parts[0] == "images" else image.name
-
-
-def _pose(matrix: Any, where: str) -> Float[Tensor, "4 4"]:
-    """A camera-to-world matrix of 3 or 4 rows, checked to be finite and rigid."""
-    rows = matrix if isinstance(matrix, list) else []
-    if len(rows) not in (3, 4) or any(not isinstance(row, list) or len(row) != 4 for row in rows):
-        raise InputError(f"`transform_matrix` of {where} must be 4 rows of 4 numbers. Correct or remove that frame.")
-    try:
-        values = [[float(value) for value in row] for row in rows]
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"`transform_matrix` of {where} must hold numbers: {error}. Correct that frame.") from error
-    pose = torch.tensor([*values, [0.0, 0.0, 0.0, 1.0]][:4], dtype=torch.float64)
-    check_pose(pose, where)
-    return pose
 
 
 def _size(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The first Gaussians: from sparse points, from silhouettes, or at random where the cameras look."""
+"""The first Gaussians: from sparse points, silhouettes or stereo, or at random where the cameras look."""
 
 from gsopt.init.first import first_gaussians
 

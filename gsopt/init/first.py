@@ -21,7 +21,7 @@ from gsopt.init.rig import find_focus
 from gsopt.init.stereo.points import stereo_points
 
 ENOUGH_POINTS = 100
-"""Sparse points from which on they beat the other methods in "auto"."""
+"""Sparse points from which on they beat the hull and random points."""
 ENOUGH_AGREED = 0.05
 """Share of the pixels on which two photos must agree: photos of different rooms agree on 0.03 by chance."""
 FEW_PHOTOS = 10

@@ -57,7 +57,9 @@ def thickest(photo: Photo, points: Float[Tensor, "M 3"], voxel: float, thick: Fl
         return found
     step = max(1, math.ceil(voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth[shown].median())))
     width, height = math.ceil(photo.camera.width / step), math.ceil(photo.camera.height / step)
-    pixel = (row[shown] / step).long() * width + (column[shown] / step).long()
+    # A point on the far border counts as shown, by the last pixel.
+    x, y = ((column[shown] / step).long().clamp(max=width - 1), (row[shown] / step).long().clamp(max=height - 1))
+    pixel = y * width + x
     most = torch.zeros(width * height).scatter_reduce(0, pixel, thick[shown], "amax")
     found[shown] = most[pixel]
     return found

@@ -29,7 +29,7 @@ from gsopt.sds.prior import Images, Prior
 from gsopt.sds.views import square_views
 from gsopt.training.targets import BACKGROUNDS
 
-FOLDER = "guidance"
+FOLDER, CONDITIONING = "guidance", "conditioning.safetensors"
 EMBEDDED_INPUTS = 8
 """Input views whose CLIP embeddings are averaged."""
 LARGEST_REFERENCE = 64 << 20
@@ -41,10 +41,7 @@ SHOWN_STEPS = 4
 
 
 def make_conditioning(config: TrainConfig, scene: Scene, prior: Prior, folder: Path, warn: Warn) -> Conditioning:
-    """The run's conditioning: what it saved earlier, else prompts and images encoded now and saved."""
-    path = folder / "conditioning.safetensors"
-    if path.exists():
-        return Conditioning.load(path)
+    """The run's conditioning, prompts and images encoded, saved for a session that resumes the run."""
     prompts = read_guidance_prompts(config)
     references = read_references(config.guidance.ref_image, prior.size)
     step = max(1, -(-len(scene.train) // EMBEDDED_INPUTS))
@@ -54,7 +51,7 @@ def make_conditioning(config: TrainConfig, scene: Scene, prior: Prior, folder: P
     )
     folder.mkdir(exist_ok=True)
     write_prompts(folder / "prompts.json", made.prompts)
-    made.save(path)
+    made.save(folder / CONDITIONING)
     for note in made.notes:
         warn(note)
     if config.guidance.front_view is None and any(p.view not in ("all", "top") for p in prompts):

@@ -10,11 +10,12 @@ from gsopt.guidance_config import settled
 from gsopt.init import first_gaussians
 from gsopt.raster.backend import Backend
 from gsopt.sds.choice import choose, fitting
+from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.coverage import coverage
 from gsopt.sds.guidance import Guide
 from gsopt.sds.opening import open_prior
 from gsopt.training import schedule
-from gsopt.training.guidance import FOLDER, RunGuidance, front_camera, make_conditioning, make_guide
+from gsopt.training.guidance import CONDITIONING, FOLDER, RunGuidance, front_camera, make_conditioning, make_guide
 from gsopt.training.leave_one_out import Verdict, judge_guidance
 from gsopt.training.run_directory import RunDirectory
 
@@ -38,12 +39,16 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
     folder = directory.path / FOLDER
     prior = open_prior(recorded["prior"], config.guidance)
     directory.emit("guidance", message=f"prior {prior.name}, {recorded['reason']}", prior=prior.name)
-    conditioning = make_conditioning(config, scene, prior, folder, directory.warn)
+    judged, saved = "guard" in recorded, folder / CONDITIONING
+    if judged and saved.exists():
+        conditioning = Conditioning.load(saved)
+    else:  # what stands there without a verdict is of a run that was broken off, perhaps of other words
+        conditioning = make_conditioning(config, scene, prior, folder, directory.warn)
 
     def guide(weight: float) -> Guide:
         return make_guide(config, scene, backend, prior, conditioning, weight, front, directory.warn)
 
-    if "guard" not in recorded:
+    if not judged:
         weight = float(recorded["lambda_sds"])
         if decided(config, scene, guide(weight)):
             verdict = Verdict(1.0, "not checked: the input views decide everywhere already", [])

@@ -97,12 +97,14 @@ def short_config(config: TrainConfig, scene: Scene, view_conditioned: bool) -> T
     steps = config.guidance.guard_steps
     longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
     halvings = min(6, max(0, round(math.log2(longest / SIDE))))
+    # What was asked for may not fit with a view less, where "auto" then takes something else.
+    method = "auto" if config.init.method in ("hull", "stereo") else config.init.method
     guidance = settled(config.guidance, view_conditioned)
     guidance = replace(guidance, every=min(guidance.every or 1, max(1, steps // 24)), refresh_every=max(1, steps // 8))
     return replace(
         config,
         iterations=steps,
-        init=InitConfig(config.init.method, min(GAUSSIANS, config.init.count)),
+        init=InitConfig(method, min(GAUSSIANS, config.init.count)),
         density=replace(config.density, refine_start=steps, refine_stop=steps),
         # Downscaled by 2 for every entry that no step passes.
         schedule=ScheduleConfig(coarse_until=tuple(steps + i for i in range(halvings))),

@@ -238,6 +238,8 @@ def _preview(trainer: Trainer, directory: RunDirectory) -> None:
 
 
 def _tell(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
+    if trainer.shown.loss is None:  # so far only mirror images were drawn
+        return
     rate = clock.rate(trainer.step)
     left = trainer.config.iterations - trainer.step
     psnr = trainer.shown.psnr

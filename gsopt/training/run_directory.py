@@ -149,7 +149,8 @@ def first_difference(old: dict[str, Any], new: dict[str, Any], where: str = "") 
         name = f"{where}{key}"
         if name in FREE or new[key] == value:
             continue
-        if isinstance(value, dict):
-            return first_difference(value, new[key], f"{name}.")
-        return f"`{name}` was {value!r}, now {new[key]!r}"
+        if not isinstance(value, dict):
+            return f"`{name}` was {value!r}, now {new[key]!r}"
+        if inner := first_difference(value, new[key], f"{name}."):
+            return inner
     return None

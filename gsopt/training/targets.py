@@ -39,7 +39,8 @@ class Target:
 
 def content_pixels(views: Sequence[View], most: int = 16) -> float:
     """How many pixels of an image show something, alpha counted as a share: the mean over up to `most` spread views."""
-    chosen = views[:: max(1, len(views) // most)][:most]
+    count = min(most, len(views))
+    chosen = [views[i * len(views) // count] for i in range(count)]
     return sum(_content(view.pixels()) for view in chosen) / len(chosen)
 
 

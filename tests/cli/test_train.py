@@ -136,8 +136,8 @@ def test_the_density_flags_are_the_density_settings() -> None:
         ("A --max-gaussians 0", "--max-gaussians"),
         ("A -w --background black", "contradict"),
         ("A --resume", "-m RUN"),
-        ("--resume -m RUN --iterations 5", "--iterations"),
-        ("--resume -m RUN --density.growth 2", "--density"),
+        ("--resume -m RUN --iterations 5", "`iterations`"),
+        ("--resume -m RUN --density.growth 2", "`density.growth`"),
     ],
 )
 def test_flags_that_make_no_sense_are_usage_errors(capsys, argv: str, told: str) -> None:
@@ -194,6 +194,9 @@ def test_a_folder_with_a_run_is_refused_and_resume_needs_only_the_folder(
     assert cli.main(["train", "--resume", "-m", str(run)]) == 0
     assert "resumed at step 20" in capsys.readouterr().out
     assert (run / "splat.ply").read_bytes() == before
+    for flags, name in (("--strategy mcmc", "density.strategy"), ("--lambda-sds 0.1", "guidance.lambda_sds")):
+        assert cli.main(["train", "--resume", "-m", str(run), *flags.split()]) == UsageError.exit_code
+        assert f"`{name}` was given with --resume" in capsys.readouterr().err
     assert cli.main(["train", "--resume", *small(data, run), "--seed", "1"]) == UsageError.exit_code
     assert "`seed` was 0, now 1" in capsys.readouterr().err
 
@@ -256,3 +259,11 @@ def test_nothing_is_called_held_out_that_was_not() -> None:
 def test_flags_become_settings_without_touching_the_disk(tmp_path: Path) -> None:
     make_config(parsed("DATA"), tmp_path / "absent")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_resumed_run_keeps_its_own_pace_unless_told_otherwise(tmp_path: Path) -> None:
+    flags = ["scene", "-m", str(tmp_path), "--threads", "1", "--preview-every", "0"]
+    config, _ = read_flags(tyro.cli(Flags, args=flags))
+    (tmp_path / "config.json").write_text(json.dumps({"config": config.to_dict()}))
+    again, _ = read_flags(tyro.cli(Flags, args=["--resume", "-m", str(tmp_path), "--checkpoint-every", "7"]))
+    assert again == dataclasses.replace(config, checkpoint_every=7)

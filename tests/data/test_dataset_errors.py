@@ -167,6 +167,16 @@ def test_a_ply_that_promises_more_than_it_holds_is_refused(tmp_path: Path) -> No
         load_scene(tmp_path)
 
 
+def test_a_ply_whose_colors_are_lists_is_refused(tmp_path: Path) -> None:
+    nerfstudio(tmp_path, ply_file_path="cloud.ply")
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    properties += "".join(f"property list uchar uchar {color}\n" for color in ("red", "green", "blue"))
+    rows = "0 0 0 2 1 1 1 1 1 1\n1 1 1 1 2 1 2 1 2\n"
+    (tmp_path / "cloud.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n{rows}")
+    with pytest.raises(InputError, match=r"Cannot read the points .*cloud\.ply"):
+        load_scene(tmp_path)
+
+
 junk = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),

@@ -11,7 +11,7 @@ import torch
 from dataset_builders import SIZE, save_image
 from PIL import Image
 
-from gsopt.data.images import MAX_PIXELS, ImageStore, Picture, read_header, read_pixels
+from gsopt.data.images import MAX_PIXELS, ImageStore, Picture, read_gray, read_header, read_pixels
 from gsopt.errors import InputError
 
 
@@ -155,3 +155,16 @@ def test_downscaling_is_the_area_mean(tmp_path: Path) -> None:
     got = ImageStore([plain(tmp_path / "a.png", size=4)], 1).get(0).numpy()
     want = pixels.reshape(4, 4, 4, 4, 3).mean(axis=(1, 3))
     assert np.abs(got - want).max() <= 0.5001
+
+
+@pytest.mark.parametrize("white", [1, 255, 65535])
+def test_a_mask_of_sixteen_bits_counts_whatever_its_white(tmp_path: Path, white: int) -> None:
+    save_image(tmp_path / "m.png", (np.eye(4) * white).astype(np.uint16))
+    gray = read_gray(tmp_path / "m.png", (4, 4))
+    assert (gray > 0).tolist() == (np.eye(4) > 0).tolist()
+
+
+def test_floating_point_images_are_refused(tmp_path: Path) -> None:
+    Image.fromarray(np.eye(4, dtype=np.float32)).save(tmp_path / "f.tiff")
+    with pytest.raises(InputError, match="floating-point"):
+        read_pixels(tmp_path / "f.tiff")

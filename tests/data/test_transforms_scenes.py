@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -208,3 +209,13 @@ def test_real_fox(shared_data: Path) -> None:
     assert scene.test[0].name == "images/0001.jpg"
     assert "17 are absent" in scene.warnings[0]
     assert scene.train[0].pixels().shape == (480, 270, 3)
+
+
+def test_a_test_split_without_images_is_none(tmp_path: Path) -> None:
+    nerf_synthetic(tmp_path)
+    (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")
+    document = {"camera_angle_x": 0.7, "frames": frames_of(ring(2), ["./gone/a", "./gone/b"])}
+    (tmp_path / "transforms_test.json").write_text(json.dumps(document))
+    assert len(load_scene(tmp_path).test) == 3
+    (tmp_path / "transforms_val.json").unlink()
+    assert len(load_scene(DataConfig(path=str(tmp_path), eval=True)).test) == 2

@@ -11,7 +11,7 @@ from dataset_builders import nerf_synthetic, nerfstudio
 from gsopt.config import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.data.split import farthest_points
-from gsopt.errors import UsageError
+from gsopt.errors import InputError, UsageError
 
 
 def names(root: Path, **settings: object) -> list[str]:
@@ -74,6 +74,11 @@ def test_view_ids_count_in_name_order_after_the_hold_out_elsewhere(tmp_path: Pat
 def test_impossible_choices_are_refused(tmp_path: Path, settings: dict[str, object], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         names(nerf_synthetic(tmp_path), **settings)
+
+
+def test_one_image_that_is_held_out_leaves_nothing_to_choose_from(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no input view left"):
+        load_scene(DataConfig(path=str(nerfstudio(tmp_path, count=1)), eval=True, view_ids=(0,)))
 
 
 def test_the_test_views_stay_whatever_is_chosen(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from shapes import ellipsoid_scene, spread_cameras
 
+from gsopt.cameras import Cameras
 from gsopt.data.scene import load_scene
 from gsopt.init.hull import carve
 from gsopt.init.photos import Photo, small_photos
@@ -93,3 +94,10 @@ def test_what_no_photo_shows_stays(tmp_path: Path) -> None:
     grid, photos = hull_of(tmp_path, 3)
     far = grid.centers(grid.occupied) + 1e4
     assert torch.equal(rounded(grid.occupied, far, grid.voxel, photos), grid.occupied)
+
+
+def test_a_point_on_the_border_belongs_to_the_last_pixel() -> None:
+    K = torch.tensor([[[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]])
+    photo = Photo(Cameras(torch.eye(4)[None], K, 100, 100), torch.full((4, 100, 100), 255, dtype=torch.uint8))
+    points = torch.tensor([[0.0, 0.5, 1.0], [0.5, 0.1, 1.0], [0.5, 0.5, 1.0]])
+    assert thickest(photo, points, 0.001, torch.tensor([1.0, 2, 3])).tolist() == [1, 2, 3]

@@ -15,6 +15,7 @@ from gsopt.config import TrainConfig
 from gsopt.errors import InputError
 from gsopt.events import read_events
 from gsopt.guidance_config import GuidanceConfig
+from gsopt.sds.conditioning import Conditioning
 from gsopt.training import guided_run
 from gsopt.training.loop import train
 from gsopt.training.trainer import Trainer
@@ -132,3 +133,15 @@ def test_at_lambda_0_nothing_of_diffusion_is_loaded_and_the_reason_is_told(datas
     started = read_events(tmp_path / "run" / "events.jsonl")[0][0]
     assert started["guidance"]["prior"] is None
     assert "lambda_sds is 0" in started["guidance"]["reason"]
+
+
+def test_words_of_a_run_that_was_broken_off_do_not_guide_the_next_one(
+    dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(guided_run, "judge_guidance", lambda *rest: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train(config(dataset, prompt=("a cat",)), tmp_path / "run")
+    train(config(dataset, prompt=("a dog",)), tmp_path / "run")
+    folder = tmp_path / "run" / "guidance"
+    assert [prompt.text for prompt in Conditioning.load(folder / "conditioning.safetensors").prompts] == ["a dog"]

@@ -12,6 +12,7 @@ from balls import Ball, mirrored, ring, write_balls
 from tiny_scenes import tiny_config
 
 from gsopt.cameras import Cameras
+from gsopt.cli.console import RunConsole
 from gsopt.config import InitConfig, PoseConfig, SparseConfig, TrainConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
@@ -121,3 +122,11 @@ def test_a_view_that_is_left_out_takes_its_mirror_images_along(one_sided: Path) 
     assert left.view == scene.train[1]
     assert len(left.scene.mirrored) == 2 * (len(scene.train) - 1)
     assert not any(view.index == left.view.index for view in left.scene.drawn)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_run_of_one_step_ends_well_whatever_it_draws(seed: int, one_sided: Path, tmp_path: Path) -> None:
+    """There is no loss to tell of as long as only mirror images were drawn."""
+    train(config_of(one_sided, iterations=1, seed=seed), tmp_path / "run", on_progress=RunConsole(tmp_path / "run"))
+    losses = [event["loss"] for event in read_events(tmp_path / "run" / "events.jsonl")[0] if "loss" in event]
+    assert None not in losses

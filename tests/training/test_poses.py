@@ -14,8 +14,9 @@ from tiny_scenes import cloud, ring, tiny_config
 
 from gsopt import cli
 from gsopt.config import PoseConfig, SparseConfig
+from gsopt.data.refined import with_refined_poses
 from gsopt.data.scene import load_scene
-from gsopt.errors import UsageError
+from gsopt.errors import InputError, UsageError
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.training.loop import train
@@ -98,3 +99,25 @@ def test_a_rate_that_makes_no_sense_is_refused(dataset: Path, capsys: pytest.Cap
         PoseConfig(lr=0.0)
     assert cli.main(["train", str(dataset), "--refine-poses", "--poses.start", "-1"]) == UsageError.exit_code
     assert "`--poses.start` must be at least 0, got -1" in capsys.readouterr().err
+
+
+def test_a_run_is_judged_and_drawn_where_it_put_its_views(dataset: Path, tmp_path: Path) -> None:
+    """Written in the source's frame, read into the scene's, which may be moved; views it does not name stay."""
+    scene = replace(load_scene(dataset), origin=(5.0, -3.0, 2.0))
+    assert with_refined_poses(scene, tmp_path) is scene
+    refinement = PoseRefinement(PoseConfig(refine=True), scene, 10)
+    refinement.viewmats[1] = rigid_motion(torch.tensor([0.1, 0.0, 0.2, 0.3, 0.0, 0.1]).double()) @ refinement.given[1]
+    record = refinement.record(scene.origin)
+    del record["views"][0]
+    (tmp_path / "poses.json").write_text(json.dumps(record))
+    moved = with_refined_poses(scene, tmp_path)
+    found = torch.cat([view.camera.viewmats for view in moved.train]).double()
+    torch.testing.assert_close(found, refinement.viewmats, atol=1e-5, rtol=0)
+    assert moved.train[0] is scene.train[0]
+
+
+@pytest.mark.parametrize("views", [3, [3], [{"name": "a"}], [{"name": "a", "cam_from_world": [[2, 0, 0, 0]] * 4}]])
+def test_refined_poses_that_are_garbled_are_named(views: object, dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "poses.json").write_text(json.dumps({"views": views}))
+    with pytest.raises(InputError, match=r"poses\.json"):
+        with_refined_poses(load_scene(dataset), tmp_path)

@@ -207,6 +207,8 @@ def test_other_settings_are_refused_on_resume_but_threads_may_change(dataset: Pa
     before = (run / "events.jsonl").read_bytes()
     with pytest.raises(UsageError, match=r"`density.growth` was 1.05, now 1.5"):
         train(replace(config, density=replace(config.density, growth=1.5)), run, resume=True)
+    with pytest.raises(UsageError, match=r"`seed` was 0, now 9"):  # after a part with a setting that may change
+        train(replace(config, data=replace(config.data, cache_mb=1), seed=9), run, resume=True)
     assert (run / "config.json").exists()
     assert (run / "events.jsonl").read_bytes().startswith(before)
     train(replace(config, threads=3, preview_every=0), run, resume=True)
