@@ -64,7 +64,7 @@ class Loading:
         except GsoptError as error:
             self.error = str(error)
         except MemoryError:
-            self.error = f"{self.path.name} does not fit into memory. Close other files, or thin it with `gsopt`."
+            self.error = f"{self.path.name} does not fit into memory. Close other files, or show fewer splats."
         except Exception as error:
             self.error = f"{self.path.name} could not be read: {error!r:.200}. Please report it."
 

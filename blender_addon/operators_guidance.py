@@ -29,7 +29,7 @@ class GSOPT_OT_prompt_add(Telling, bpy.types.Operator):
     bl_label = "Add Prompt"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    text: bpy.props.StringProperty(name="Text", maxlen=1000)  # type: ignore[valid-type]
+    text: bpy.props.StringProperty(name="Text")  # type: ignore[valid-type]
     polarity: bpy.props.StringProperty(name="Polarity", default="positive")  # type: ignore[valid-type]
 
     def do(self, context: Any) -> None:
@@ -76,6 +76,10 @@ class GSOPT_OT_prompts_read(Telling, bpy.types.Operator):
         for prompt in found.prompts:
             watching.fill_prompt(settings.prompts.add(), prompt)
         settings.prompts_rest = json.dumps(found.rest)
+        listed = {entry.path for entry in settings.references}
+        for path in map(str, found.accepted(absolute(self.filepath).parent)):
+            if path not in listed:
+                settings.references.add().path = path
         return f"{len(found.prompts)} prompts"
 
 
@@ -87,6 +91,7 @@ class GSOPT_OT_prompts_write(Telling, bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
     filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})  # type: ignore[valid-type]
+    check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         self.filepath = self.filepath or "prompts.json"
@@ -95,7 +100,7 @@ class GSOPT_OT_prompts_write(Telling, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         path = absolute(self.filepath)
-        prompts.write_prompts(path, document(context.scene.gsopt))
+        prompts.write_prompts(path, document(context.scene.gsopt).beside(path.parent))
         return f"Wrote {path}"
 
 
@@ -127,8 +132,8 @@ class GSOPT_OT_proposal(Telling, bpy.types.Operator):
     bl_label = "Proposal"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
-    accept: bpy.props.BoolProperty(default=True)  # type: ignore[valid-type]
-    all: bpy.props.BoolProperty(default=False)  # type: ignore[valid-type]
+    accept: bpy.props.BoolProperty(default=True, options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    all: bpy.props.BoolProperty(default=False, options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
     def do(self, context: Any) -> None:
         settings = context.scene.gsopt
@@ -178,7 +183,7 @@ def guidance(settings: Any, folder: Path) -> arguments.Guidance:
     """What the panel says about guidance; its prompts are written into `folder`."""
     if settings.prior == "FOLDER" and not settings.prior_folder:
         raise UsageError("The prior is a folder, but none is chosen. Choose a model in diffusers' layout.")
-    listed = document(settings)
+    listed = document(settings).beside(folder)
     path = folder / "prompts.json"
     if listed.prompts and settings.prior != "off":
         folder.mkdir(parents=True, exist_ok=True)

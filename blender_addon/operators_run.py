@@ -94,7 +94,7 @@ class GSOPT_OT_stop(Waiting, bpy.types.Operator):
     bl_idname = "gsopt.stop"
     bl_label = "Stop"
 
-    kill: bpy.props.BoolProperty(name="End at Once", default=False)  # type: ignore[valid-type]
+    kill: bpy.props.BoolProperty(name="End at Once", default=False, options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
     def do(self, context: Any) -> str:
         found = watching.follower(context.scene)
@@ -115,7 +115,7 @@ class GSOPT_OT_attach(Telling, bpy.types.Operator):
     bl_idname = "gsopt.attach"
     bl_label = "Attach"
 
-    directory: bpy.props.StringProperty(subtype="DIR_PATH")  # type: ignore[valid-type]
+    directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         if self.directory:

@@ -55,12 +55,12 @@ def items(*names: str) -> list[tuple[str, str, str]]:
 class GsoptPrompt(bpy.types.PropertyGroup):
     """One prompt; the fields of prompts.json."""
 
-    text: StringProperty(name="Text", maxlen=1000)  # type: ignore[valid-type]
+    text: StringProperty(name="Text")  # type: ignore[valid-type]
     weight: FloatProperty(name="Weight", default=1.0, min=0.0, max=1000.0, soft_max=2.0)  # type: ignore[valid-type]
     view: EnumProperty(name="View", items=items("all", "front", "side", "back", "top"))  # type: ignore[valid-type]
     polarity: EnumProperty(name="Polarity", items=items("positive", "negative"))  # type: ignore[valid-type]
     source: StringProperty(name="Source", default="user")  # type: ignore[valid-type]
-    rationale: StringProperty(name="Why", maxlen=4000)  # type: ignore[valid-type]
+    rationale: StringProperty(name="Why")  # type: ignore[valid-type]
     score: FloatProperty(name="Alignment", default=-2.0)  # type: ignore[valid-type]
     """CLIP alignment with the input views; -2 where nobody measured it."""
 
@@ -102,7 +102,7 @@ class GsoptScene(bpy.types.PropertyGroup):
     domain: EnumProperty(name="Domain", items=DOMAINS)  # type: ignore[valid-type]
     template: StringProperty(name="Template", subtype="FILE_PATH")  # type: ignore[valid-type]
     notes: StringProperty(
-        name="Notes", description="What you know about it: material, parts, wear, what no photo shows", maxlen=4000
+        name="Notes", description="What you know about it: material, parts, wear, what no photo shows"
     )  # type: ignore[valid-type]
     prompts: CollectionProperty(type=GsoptPrompt)  # type: ignore[valid-type]
     prompt_index: IntProperty()  # type: ignore[valid-type]

@@ -175,14 +175,6 @@ def set_input(modifier: Any, name: str, value: Any) -> None:
     modifier.id_data.update_tag()
 
 
-def get_input(modifier: Any, name: str) -> Any:
-    """The value of an input; of the display the name of the menu's item."""
-    key = identifier(modifier, name)
-    if hasattr(modifier, "properties"):
-        return getattr(modifier.properties.inputs, key).value
-    return nodes.DISPLAYS[modifier.get(key, 0)] if name == "Display" else modifier.get(key)
-
-
 def pixel_filter(angle_x: float, width: int, variance: float = 0.3) -> float:
     """gsopt's 0.3 px² as a share of the squared distance, for a camera of that width in pixels."""
     return variance * (2 * math.tan(0.5 * angle_x) / width) ** 2

@@ -23,7 +23,7 @@ class Telling:
         context.scene.gsopt.message = ""
         try:
             said = self.do(context)  # type: ignore[attr-defined]
-        except GsoptError as error:
+        except (GsoptError, OSError) as error:
             context.scene.gsopt.message = str(error)
             self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
             return {"CANCELLED"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import math
 import types
 import typing
 from dataclasses import dataclass, field
@@ -20,6 +19,8 @@ from gsopt.presets import PRESETS, Preset
 T = TypeVar("T")
 
 MOST = 1e9
+LARGEST = 1e300
+"""No number of a file reaches it: whole numbers may be longer than a float holds, and sums must not overflow."""
 """Upper bound of weights and rates: keeps infinities and typing errors out."""
 LARGEST_CONFIG = 1 << 20
 """Bytes of config.json that are read."""
@@ -360,7 +361,7 @@ def _matches(hint: Any, value: Any) -> bool:
     if origin is tuple:
         return isinstance(value, (list, tuple)) and all(_matches(args[0], item) for item in value)
     if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < LARGEST
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     return value is None if hint is type(None) else isinstance(value, hint)

@@ -18,6 +18,8 @@ from typing import Any
 from gsopt.errors import InputError, UsageError
 
 VERSION = 1
+LARGEST_LOG = 1 << 28
+"""Bytes of events; a run of days has a tenth of it."""
 LAST = ("done", "stopped", "error")
 
 
@@ -91,12 +93,20 @@ def _lock(descriptor: int, path: Path) -> None:
 
 
 def read_events(path: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
-    """Events after byte `offset` and the offset to go on from; broken lines are skipped, a higher version refused."""
+    """Events after byte `offset` and the offset to go on from; broken lines are skipped.
+
+    Raises InputError for a higher version, for a file that cannot be read and for more than LARGEST_LOG bytes.
+    """
     if not path.exists():
         return [], offset
-    with open(path, "rb") as file:
-        file.seek(offset)
-        data = file.read()
+    try:
+        with open(path, "rb") as file:
+            file.seek(offset)
+            data = file.read(LARGEST_LOG + 1)
+    except OSError as error:
+        raise InputError(f"Cannot read {path}: {error.strerror}. Check the run's folder.") from error
+    if len(data) > LARGEST_LOG:
+        raise InputError(f"{path} has more than {LARGEST_LOG >> 20} MB of events. Move it away.")
     end = data.rfind(b"\n") + 1
     events: list[dict[str, Any]] = []
     for line in data[:end].splitlines():

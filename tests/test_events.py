@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError, UsageError
-from gsopt.events import EventWriter, read_events, to_json, write_atomic
+from gsopt.events import LARGEST_LOG, EventWriter, read_events, to_json, write_atomic
 
 FIELDS = st.dictionaries(
     st.sampled_from(["step", "message", "loss", "path"]),
@@ -107,6 +107,16 @@ def test_a_folder_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> No
         write_atomic(tmp_path / "file" / "metrics.json", b"{}")
     with pytest.raises(InputError, match="Cannot write"):
         EventWriter(tmp_path / "absent")
+
+
+def test_a_log_without_end_and_a_folder_in_its_place_are_input_errors(tmp_path: Path) -> None:
+    with open(tmp_path / "events.jsonl", "wb") as file:
+        file.truncate(LARGEST_LOG + 1)
+    with pytest.raises(InputError, match="256 MB of events"):
+        read_events(tmp_path / "events.jsonl")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="Cannot read"):
+        read_events(tmp_path / "folder")
 
 
 def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:

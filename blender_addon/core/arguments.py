@@ -48,16 +48,21 @@ class Guidance:
 def train(python: Path, data: Path, run: Path, training: Training, guidance: Guidance) -> list[str]:
     """`gsopt train` with a live preview about twenty times."""
     words = [str(python), "-m", "gsopt", "train", str(data), "-m", str(run)]
-    words += ["--preset", training.preset] if training.preset else ["--iterations", str(training.iterations)]
+    words += ["--preset", training.preset] if training.preset else own(training)
     steps = STEPS.get(training.preset, training.iterations)
     words += ["--preview-every", str(max(25, min(500, steps // 20))), "--seed", str(training.seed)]
-    words += ["--strategy", training.strategy, "--background", training.background]
     words += ["--threads", str(training.threads), "--backend", training.backend]
-    words += ["--resolution", str(training.downscale)] if training.downscale > 1 and not training.preset else []
     words += ["--max-gaussians", str(training.max_gaussians)] if training.max_gaussians else []
     words += ["--views", str(training.views)] if training.views else []
-    words += ["--eval"] if training.hold_out else []
     return words + guide(guidance)
+
+
+def own(training: Training) -> list[str]:
+    """What the panel shows in place of a preset."""
+    words = ["--iterations", str(training.iterations), "--strategy", training.strategy]
+    words += ["--background", training.background]
+    words += ["--resolution", str(training.downscale)] if training.downscale > 1 else []
+    return words + (["--eval"] if training.hold_out else [])
 
 
 def guide(guidance: Guidance) -> list[str]:

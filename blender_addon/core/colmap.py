@@ -17,8 +17,6 @@ from .errors import InputError
 LARGEST_FILE = 1 << 30
 SHARED_FOCAL = (0, 2, 3, 8, 9)
 """SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL and the simple fisheyes: f, cx, cy."""
-TWO_FOCALS = (1, 4, 5, 6, 7, 10)
-"""PINHOLE, OPENCV and the like: fx, fy, cx, cy."""
 PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
 
 

@@ -5,7 +5,6 @@ What the file holds beside its prompts (notes, domain, how they were made, image
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
 from dataclasses import asdict, dataclass, field, fields
@@ -24,6 +23,8 @@ LARGEST_WEIGHT = 1000.0
 VIEWS = ("all", "front", "side", "back", "top")
 POLARITIES = ("positive", "negative")
 DOMAINS = ("generic", "medicine", "robotics", "arvr", "environment")
+FILE = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+"""Beside the file or one folder below."""
 SOURCE = re.compile(r"user|template|llm:[^\s<>]{1,200}")
 
 
@@ -65,6 +66,22 @@ class Document:
     prompts: tuple[Prompt, ...]
     rest: dict[str, Any] = field(default_factory=dict)
     """The other keys, untouched."""
+
+    def accepted(self, folder: Path) -> list[Path]:
+        """The pictures that were accepted and lie where a file in `folder` says."""
+        return [path for path, accepted in self._pictures(folder) if accepted and path.is_file()]
+
+    def beside(self, folder: Path) -> Document:
+        """As a file in `folder` may say it: pictures are named by their place beside it, and only those there are."""
+        if all(path.is_file() for path, _ in self._pictures(folder)):
+            return self
+        return Document(self.prompts, {key: value for key, value in self.rest.items() if key != "images"})
+
+    def _pictures(self, folder: Path) -> list[tuple[Path, bool]]:
+        listed = self.rest.get("images")
+        rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
+        names = [(row["file"], row.get("accepted") is True) for row in rows if FILE.fullmatch(str(row.get("file")))]
+        return [(folder / name, accepted) for name, accepted in names]
 
 
 def read_prompts(path: Path) -> Document:
@@ -110,7 +127,7 @@ def require_text(value: Any, name: str, longest: int) -> None:
 
 
 def require_number(value: Any, name: str, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
         raise InputError(f"`{name}` of a prompt must be a number, got {value!r:.40}. Correct it.")
     if not low <= value <= high:
         raise InputError(f"`{name}` of a prompt must lie in [{low:g}, {high:g}], got {value:g}. Correct it.")

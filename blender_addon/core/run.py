@@ -23,7 +23,7 @@ PIECE = 1 << 18
 FAR_BEHIND = 1 << 21
 """From here on the reader skips ahead to the last piece."""
 SILENCE = 900.0
-"""Seconds after which a run that somebody else started and that has no event yet counts as ended."""
+"""Seconds without a word after which a run counts as ended where its process is not known."""
 FINAL = ("done", "stopped", "error")
 MOST_MESSAGES = 50
 LONGEST = 500
@@ -105,10 +105,10 @@ class Follower:
             self._offset, self._broken = self._offset + PIECE, True  # no event is that long: skip to its end
             return True
         lines = data[:end].split(b"\n")
-        for event in events_in(lines[1:] if self._broken else lines, path):
+        broken, self._broken = self._broken, self._broken and not end
+        self._offset += end  # first: what cannot be taken is not read again
+        for event in events_in(lines[1:] if broken else lines, path):
             self._take(event)
-        self._broken = self._broken and not end
-        self._offset += end
         return self._offset < size and end > 0 and len(data) == PIECE
 
     def _take(self, event: dict[str, Any]) -> None:
@@ -137,12 +137,18 @@ class Follower:
                 run.status = "killed" if run.status == "running" else "error"
                 said = jobs.complaint(self.job) if run.status == "error" else "It ended without a word. See the log."
                 run.say(f"{said} Continue it with Resume." if run.status == "killed" else said)
-        elif run.status == "running" and run.pid and not jobs.process_alive(run.pid, run.began):
+        elif run.status == "running" and not self._goes_on():
             run.status = "killed"
             run.say("The run was killed. Continue it from its last checkpoint with Resume.")
         elif run.status == "waiting" and time.time() - changed(run.path) > SILENCE:
             run.status = "error"
             run.say("It has said nothing for a long time and seems to have ended before its first step. See its log.")
+
+    def _goes_on(self) -> bool:
+        """Whether the process lives; where the reader skipped its name, whether it said something of late."""
+        if self.run.pid:
+            return jobs.process_alive(self.run.pid, self.run.began)
+        return time.time() - changed(self.run.path / "events.jsonl") < SILENCE
 
     def _more(self) -> bool:
         """Whether the process wrote something between the last read and its end."""
@@ -181,21 +187,26 @@ def whole(value: Any, otherwise: int = 0) -> int:
 
 
 def number(value: Any) -> float | None:
-    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+    """A number that Blender's properties can hold."""
+    usable = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e30
+    return float(value) if usable else None
 
 
 def inside(run: Path, name: Any) -> str:
     """An announced file of the run, absolute; empty when it is none or points out of the directory."""
     if not isinstance(name, str) or not name:
         return ""
-    path = (run / name).resolve()
+    try:
+        path = (run / name).resolve()
+    except (OSError, ValueError):  # a name that no file system has
+        return ""
     return str(path) if path.is_relative_to(run.resolve()) else ""
 
 
-def changed(run: Path) -> float:
-    """When something was written to the folder, seconds since 1970; now, where that is not known."""
+def changed(path: Path) -> float:
+    """When a file, or a folder's list of files, was changed, seconds since 1970; now, where that is not known."""
     try:
-        return run.stat().st_mtime
+        return path.stat().st_mtime
     except OSError:
         return time.time()
 

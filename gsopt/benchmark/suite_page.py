@@ -26,7 +26,6 @@ METRICS = {
     "depth_error": ("depth error", 4),
 }
 COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
-BETTER_BELOW = ("lpips_alex", "lpips_vgg", "depth_error")
 SEEDS = 3
 Table = tuple[list[str], list[list[str]]]
 

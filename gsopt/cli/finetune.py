@@ -58,8 +58,9 @@ def finetune(
 
 def main(argv: Sequence[str]) -> int:
     """Parse the arguments after `gsopt finetune` and run it; the exit code."""
-    if ON_VIEWS in argv:
+    others = [argument for argument in argv if argument.replace("_", "-") != ON_VIEWS]
+    if len(others) < len(argv):
         from gsopt.cli.finetune_on_views import main as on_views
 
-        return on_views([argument for argument in argv if argument != ON_VIEWS])
+        return on_views(others)
     return tyro.cli(finetune, args=list(argv), prog="gsopt finetune")

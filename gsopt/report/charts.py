@@ -9,14 +9,16 @@ from html import escape
 WIDTH, HEIGHT = 360, 210
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 14, 36
 MOST_POINTS = 300
+SMALLEST = 1e-300
+"""Of a logarithmic axis: its ticks must not be 0."""
 
 
 def line_chart(title: str, points: Sequence[tuple[float, float]], *, log: bool = False, unit: str = "") -> str:
     """A figure with axes, the line and its last value. Fewer than two points give a sentence instead.
 
-    `log`: logarithmic vertical axis; points that are not positive are left out then.
+    `log`: logarithmic vertical axis; points that are not above SMALLEST are left out then.
     """
-    points = [point for point in points if not log or point[1] > 0]
+    points = [point for point in points if not log or point[1] > SMALLEST]
     if len(points) < 2:
         return (
             f'<figure class="chart"><figcaption>{escape(title)}</figcaption><p class="muted">Not recorded.</p></figure>'

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from PIL import Image
 
 from gsopt.cameras import Cameras
-from gsopt.config import TrainConfig
+from gsopt.config import LARGEST, TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
 from gsopt.events import read_events
@@ -27,6 +26,7 @@ EXTREMES_SHOWN = 4
 INPUTS_SHOWN = 24
 TURNTABLE_FRAMES = 36
 TURNTABLE_SIDE = 400
+LARGEST_METRICS = 64 << 20
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 
@@ -112,7 +112,7 @@ def gather(run: Path, config: TrainConfig) -> Report:
 
 def number(value: object) -> float | None:
     """A finite number, or None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
         return None
     return float(value)
 
@@ -161,7 +161,8 @@ def _read_object(path: Path, messages: list[str]) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        document = json.loads(path.read_bytes())
+        with open(path, "rb") as file:
+            document = json.loads(file.read(LARGEST_METRICS))
     except (OSError, ValueError, RecursionError) as error:
         messages.append(f"{path.name} cannot be read: {error}.")
         return {}

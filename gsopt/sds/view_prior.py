@@ -81,7 +81,6 @@ class ViewPrior:
 
     x0_limit: float | None = 1.0
     class_embedding_width: int | None = None
-    pixel_exact = True
     aligned = True
 
     def __init__(self, folder: Path, config: GuidanceConfig) -> None:

@@ -71,11 +71,13 @@ def too_many(mesh: Path, count: object, what: str, size: int) -> InputError:
 
 def check_ply(mesh: Path, size: int) -> list[str]:
     """Every element of a PLY takes at least a byte."""
-    header = read_start(mesh, MAX_HEADER).split(b"end_header")[0]
+    begin = read_start(mesh, MAX_HEADER)
+    header = begin.split(b"end_header")[0]
     if b"format ascii" in header:
-        check_numbers(mesh, rb"^[^a-z]*\b(?:nan|inf)")
+        check_numbers(mesh, rb"^[^a-z\n]*\b(?:nan|inf)")
     else:
-        check_ply_vertices(mesh, header)
+        end = re.search(rb"end_header[ \t]*\r?\n", begin)
+        check_ply_vertices(mesh, header, end.end() if end else len(begin))
     for words in [line.split() for line in header.splitlines()]:
         if len(words) == 3 and words[0] == b"element" and not (words[2].isdigit() and int(words[2][:20]) <= size):
             raise too_many(
@@ -110,8 +112,9 @@ def not_finite(mesh: Path) -> InputError:
     return InputError(f"{mesh} must have finite coordinates, got NaN or infinity. Repair or export it again.")
 
 
-def check_ply_vertices(mesh: Path, header: bytes) -> None:
-    """InputError for a NaN or an infinity in a binary PLY whose vertices come first, as exporters write them."""
+def check_ply_vertices(mesh: Path, header: bytes, start: int) -> None:
+    """InputError for a NaN or an infinity in a binary PLY whose vertices come first, at byte `start`, as exporters
+    write them."""
     order = ">" if b"binary_big_endian" in header else "<"
     first = header.partition(b"element ")[2].partition(b"element ")[0]
     vertex, *properties = [line.split() for line in first.splitlines()] or [[]]
@@ -120,7 +123,6 @@ def check_ply_vertices(mesh: Path, header: bytes) -> None:
     if len(vertex) != 2 or vertex[0] != b"vertex" or not vertex[1].isdigit() or not (properties and plain):
         return
     record = np.dtype([(str(i), order + PLY_TYPES[words[1]]) for i, words in enumerate(properties)])
-    start = len(header) + len(b"end_header") + 1
     count = min(int(vertex[1][:20]), max(0, mesh.stat().st_size - start) // record.itemsize)
     rows = np.fromfile(mesh, record, count, offset=start)
     for i, words in enumerate(properties):

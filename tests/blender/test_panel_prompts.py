@@ -99,3 +99,33 @@ def test_a_server_that_fails_is_told(panel: Any) -> None:
         fails_with("no such key", bpy.ops.gsopt.propose)
     fails_with("127.0.0.1", bpy.ops.gsopt.propose)
     assert len(panel.proposals) == 0
+
+
+def test_what_was_chosen_for_one_call_is_not_chosen_for_the_next(panel: Any) -> None:
+    """Blender keeps the properties of a call from a button, and gives them to the next one that does not set them."""
+    import bpy
+
+    for text in ("one", "two", "three"):
+        panel.proposals.add().text = text
+    assert bpy.ops.gsopt.proposal("INVOKE_DEFAULT", True, accept=True, all=True) == {"FINISHED"}
+    for text in ("four", "five", "six"):
+        panel.proposals.add().text = text
+    assert bpy.ops.gsopt.proposal("INVOKE_DEFAULT", True, accept=False) == {"FINISHED"}
+    assert len(panel.proposals) == 2
+
+
+def test_pictures_that_were_accepted_become_reference_images(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    (tmp_path / "a-images").mkdir()
+    (tmp_path / "a-images" / "1.png").touch()
+    images = [{"file": "a-images/1.png", "prompt": "a", "accepted": True}]
+    (tmp_path / "a.json").write_text(json.dumps({"version": 1, "images": images, "prompts": [{"text": "a chair"}]}))
+    for _ in range(2):  # once, however often the file is read
+        bpy.ops.gsopt.prompts_read(filepath=str(tmp_path / "a.json"))
+    assert [entry.path for entry in panel.references] == [str(tmp_path / "a-images" / "1.png")]
+    (tmp_path / "elsewhere").mkdir()
+    bpy.ops.gsopt.prompts_write(filepath=str(tmp_path / "elsewhere" / "b.json"))
+    assert "images" not in json.loads((tmp_path / "elsewhere" / "b.json").read_text())
+    bpy.ops.gsopt.prompts_write(filepath=str(tmp_path / "c.json"))
+    assert json.loads((tmp_path / "c.json").read_text())["images"] == images

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +32,19 @@ def test_gsopt_reads_the_same_prompts(tmp_path: Path) -> None:
     assert [asdict(prompt) for prompt in found] == [asdict(prompt) for prompt in PROMPTS]
 
 
+def test_pictures_are_named_only_where_they_lie(tmp_path: Path) -> None:
+    """A copy of the file elsewhere must not name what is not beside it: gsopt refuses that."""
+    images = [{"file": "a-images/1.png", "accepted": True}, {"file": "a-images/2.png"}, {"file": "../x"}, 3]
+    document = Document(PROMPTS, {"notes": "oak", "images": images})
+    assert document.accepted(tmp_path) == []
+    assert document.beside(tmp_path) == Document(PROMPTS, {"notes": "oak"})
+    (tmp_path / "a-images").mkdir()
+    for name in ("1.png", "2.png"):
+        (tmp_path / "a-images" / name).touch()
+    assert document.accepted(tmp_path) == [tmp_path / "a-images" / "1.png"]
+    assert document.beside(tmp_path) == document
+
+
 @pytest.mark.parametrize(
     "prompts",
     [
@@ -44,6 +57,7 @@ def test_gsopt_reads_the_same_prompts(tmp_path: Path) -> None:
         [{"text": "a", "colour": 1}],
         [{"text": "a", "weight": "1"}],
         [{"text": "a", "weight": -1}],
+        [{"text": "a", "weight": 10**400}],
         [{"text": "a", "weight": True}],
         [{"text": "a", "view": "below"}],
         [{"text": "a", "view": ["all"]}],
@@ -82,6 +96,7 @@ EVERYTHING = (
     [
         (arguments.Training(), arguments.Guidance()),
         (arguments.Training(preset="high", views=4), arguments.Guidance("off")),
+        (replace(EVERYTHING[0], preset="draft"), arguments.Guidance("off")),
         EVERYTHING,
         (arguments.Training(), arguments.Guidance("embedded", 0.3, None, (Path("a b.png"),), "cpu", 2)),
     ],
@@ -98,11 +113,11 @@ def test_gsopt_takes_the_flags(
     assert words[:4] == ["python", "-m", "gsopt", "train"]
     flags = tyro.cli(Flags, args=words[4:])
     assert flags.preset == (training.preset or "default")
-    steps = None if training.preset else training.iterations
-    assert (flags.iterations, flags.resolution, flags.seed) == (steps, training.downscale, training.seed)
+    own = training if not training.preset else replace(arguments.Training(), iterations=None)  # shown and meant
+    assert (flags.iterations, flags.resolution, flags.seed) == (own.iterations, own.downscale, training.seed)
     assert (flags.views or 0, flags.density.max_gaussians or 0) == (training.views, training.max_gaussians)
-    assert (flags.density.strategy, flags.background) == (training.strategy, training.background)
-    assert (flags.threads, flags.backend, flags.eval) == (training.threads, training.backend, training.hold_out)
+    assert (flags.density.strategy, flags.background or "white") == (own.strategy, own.background)
+    assert (flags.threads, flags.backend, flags.eval) == (training.threads, training.backend, own.hold_out)
     assert (str(flags.data), str(flags.run)) == (str(tmp_path / "a b"), str(tmp_path / "-run"))
     weight = {"off": 0.0, "auto": None}.get(guidance.prior, guidance.weight)
     assert flags.guidance.lambda_sds == weight

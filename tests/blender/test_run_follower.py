@@ -104,6 +104,21 @@ def test_100_mb_of_log_take_a_piece_per_poll(tmp_path: Path) -> None:
     assert follower.run.status == "running"
 
 
+def test_a_run_whose_beginning_was_skipped_is_over_once_it_is_silent(tmp_path: Path) -> None:
+    append(tmp_path, STARTED + line("progress", 1, step=1, total=100) * (runs.FAR_BEHIND // 64))
+    follower = Follower(tmp_path)
+    assert (follower.poll().status, follower.run.pid) == ("running", 0)
+    os.utime(tmp_path / "events.jsonl", (0, time.time() - runs.SILENCE - 1))
+    assert follower.poll().status == "killed"
+
+
+@pytest.mark.parametrize("fields", [{"psnr": 10**400}, {"eta_seconds": 1e308}, {"step": 10**400}, {"n": -1}])
+def test_numbers_that_no_property_holds_are_nothing(tmp_path: Path, fields: dict[str, Any]) -> None:
+    append(tmp_path, STARTED + line("progress", 1, **fields) + line("preview", 2, path="a\x00b"))
+    run = Follower(tmp_path).poll()
+    assert (run.status, run.step, run.psnr, run.eta, run.count, run.preview) == ("running", 0, None, None, 5, "")
+
+
 def test_a_line_longer_than_a_piece_is_skipped(tmp_path: Path) -> None:
     append(tmp_path, STARTED + b"x" * (3 * PIECE) + b"\n" + line("progress", 2, step=9, total=100))
     follower = Follower(tmp_path)

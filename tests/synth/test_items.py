@@ -183,6 +183,8 @@ def test_what_would_hang_or_mislead_blender_is_refused(name: str, content: bytes
         ("fine.ply", PLY.format(2).encode()),
         ("fine.stl", bytes(80) + struct.pack("<I", 1) + bytes(50)),
         ("binary.ply", BINARY_PLY + struct.pack("<Bf", 1, 2.0)),
+        ("windows.ply", BINARY_PLY.replace(b"\n", b"\r\n") + struct.pack("<Bf", 0x80, 2.0)),
+        ("long.ply", (PLY.format(60_000) + "0.125\n" * 60_000).encode()),  # a search that is not linear takes hours
         ("nancy.obj", b"o nan inf\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3"),
         ("text.stl", b"solid x\n facet normal 0 0 1\n"),
         ("negative.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1//9 -2//8 -3//7\n"),

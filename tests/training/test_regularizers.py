@@ -52,9 +52,11 @@ def test_alpha_term() -> None:
 
 
 def test_terms_of_an_empty_scene_are_empty() -> None:
-    none = torch.empty(0)
-    add_opacity_gradient(none, none, 1.0)
-    add_scale_gradient(torch.empty(0, 3), torch.empty(0, 3), 1.0)
+    opacities, scales = torch.empty(0), torch.empty(0, 3)
+    add_opacity_gradient(opacities, torch.empty(0), 1.0)
+    add_scale_gradient(scales, torch.empty(0, 3), 1.0)
+    assert (opacities.shape, scales.shape) == ((0,), (0, 3))
+    assert float(losses.opacity(opacities)) == 0 == float(losses.scale(scales))
 
 
 def test_dropout_keeps_the_mean_opacity_and_the_rest_of_the_record(gaussians) -> None:
