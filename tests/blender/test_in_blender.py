@@ -26,6 +26,20 @@ def test_what_comes_in_goes_out_the_same(panel: Any, odd_folder: Path) -> None:
         assert np.allclose(getattr(before, name), getattr(after, name), rtol=1e-5, atol=1e-6), name
 
 
+def test_an_export_has_the_name_that_was_given_and_replaces_nothing_unasked(panel: Any, tmp_path: Path) -> None:
+    """A dot in a name begins no suffix; the dialog asks about the file it was given, and about no other."""
+    import bpy
+
+    bring_in(tmp_path / "a.ply")
+    (tmp_path / "chair.ply").write_bytes(b"mine")
+    assert bpy.ops.gsopt.export.get_rna_type().properties["check_existing"].default
+    bpy.ops.gsopt.export(filepath=str(tmp_path / "chair.v2"))
+    assert len(read_ply(tmp_path / "chair.v2.ply").positions)
+    assert (tmp_path / "chair.ply").read_bytes() == b"mine"
+    fails_with("exists already", bpy.ops.gsopt.export, filepath=str(tmp_path / "chair"))
+    assert (tmp_path / "chair.ply").read_bytes() == b"mine"
+
+
 @pytest.mark.parametrize("display", list(SHOWN))
 def test_each_display_shows_every_splat_that_is_chosen(panel: Any, tmp_path: Path, display: str) -> None:
     import bpy
