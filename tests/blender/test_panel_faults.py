@@ -30,9 +30,9 @@ def test_faults_end_in_a_message(panel: Any, tmp_path: Path) -> None:
     fails_with("No splats are named", bpy.ops.gsopt.import_splats)
     (tmp_path / "photos").mkdir()
     panel.photos = str(tmp_path / "photos")
-    before, settings.folder = settings.folder, str(tmp_path / "a.ply")
+    before, panel.folder = panel.folder, str(tmp_path / "a.ply")
     fails_with("a.ply", bpy.ops.gsopt.find_poses)
-    settings.folder = before
+    panel.folder = before
     settings.interpreter = str(tmp_path / "no python")
     fails_with("not there or not a program", bpy.ops.gsopt.test)
     wrong = tmp_path / "wrong python"
