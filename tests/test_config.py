@@ -57,6 +57,7 @@ def test_an_empty_object_is_the_default() -> None:
         ({"data": {"path": 5}}, "config.data.path"),
         ({"loss": {"lambda_dssim": float("nan")}}, "config.loss.lambda_dssim"),
         ({"loss": {"lambda_alpha": float("inf")}}, "config.loss.lambda_alpha"),
+        ({"loss": {"lambda_alpha": 10**400}}, "config.loss.lambda_alpha"),
         ([], "config"),
     ],
 )

@@ -17,7 +17,7 @@ from gsopt.errors import InputError
 from gsopt.evaluation import evaluate
 from gsopt.events import EventWriter
 from gsopt.report import charts, write_report
-from gsopt.report.gather import chosen, progress_of
+from gsopt.report.gather import chosen, number, progress_of
 from gsopt.report.page import duration
 from gsopt.report.pictures import ERROR_COLORS, ERROR_FULL_SCALE, error_map
 
@@ -205,6 +205,14 @@ def test_a_chart_stays_inside_its_frame_and_keeps_the_last_value() -> None:
     assert all(charts.LEFT <= x <= charts.WIDTH and 0 <= y <= charts.HEIGHT for x, y in drawn)
     assert all(b[0] > a[0] and b[1] >= a[1] for a, b in itertools.pairwise(drawn))
     assert "<b>0.0002</b>" in svg
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_a_chart_of_any_numbers_is_drawn(log: bool) -> None:
+    points = [(0.0, 5e-324), (1.0, 9e299), (2.0, -9e299), (3.0, 1e-299), (4.0, 1.0)]
+    assert all(number(y) is not None for _, y in points)
+    assert "nan" not in charts.line_chart("Loss", points, log=log)
+    assert [number(value) for value in (10**400, 1e301, float("nan"), True)] == [None] * 4
 
 
 def test_a_chart_of_nothing_says_so() -> None:

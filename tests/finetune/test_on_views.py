@@ -302,6 +302,12 @@ def test_what_the_user_sees(learned: Path, capsys: pytest.CaptureFixture[str]) -
     assert find_folder(str(learned)).adapter is not None
 
 
+@pytest.mark.parametrize("flag", ["--on-views", "--on_views"])
+def test_the_flag_may_be_spelled_as_any_other(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["finetune", flag, "--help"]) == 0
+    assert "LoRA" in capsys.readouterr().out
+
+
 def test_a_finished_training_is_left_alone(base: Path, scene: Path, learned: Path) -> None:
     before = contents(learned)
     assert main(command(scene, learned, base)) == 0

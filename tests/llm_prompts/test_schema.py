@@ -153,6 +153,7 @@ def test_only_the_text_is_needed() -> None:
         ({"text": "a", "weight": -1}, "`weight`"),
         ({"text": "a", "weight": float("nan")}, "`weight`"),
         ({"text": "a", "weight": True}, "`weight`"),
+        ({"text": "a", "weight": 10**400}, "`weight`"),
         ({"text": "a", "view": "below"}, "`view`"),
         ({"text": "a", "view": []}, "`view`"),
         ({"text": "a", "polarity": "maybe"}, "`polarity`"),
