@@ -52,7 +52,7 @@ sanitize: $(VENV)/.for-test
 	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
 	$(PY) -S -P -m pytest tests/raster tests/init/stereo/test_matching.py
 
-# A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 5 GB of memory.
+# A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 8 GB of memory.
 test-sd21: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_SD21=full $(PY) -m pytest tests/sds/test_real_size.py
 

@@ -87,7 +87,7 @@ class GuidanceConfig:
     tiny_vae: str = ""
     """Folder or hub id of a tiny autoencoder (TAESD) to use in place of the prior's."""
     dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
-    """Of the diffusion model. auto: float16 on a GPU; on a CPU bfloat16 for large models, float32 for small ones."""
+    """Of the diffusion model. auto: float16 on a GPU; on a CPU with AVX-512 bfloat16 for large models, else float32."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the diffusion model runs. auto: the GPU when there is one."""
 

@@ -245,7 +245,6 @@ def test_nan_from_the_network_is_named(sd21: Path) -> None:
     ("name", "device", "size", "dtype"),
     [
         ("auto", "cpu", 1 << 20, torch.float32),
-        ("auto", "cpu", 2 << 30, torch.bfloat16),
         ("auto", "cuda", 2 << 30, torch.float16),
         ("bfloat16", "cpu", 1, torch.bfloat16),
         ("float32", "cuda", 1, torch.float32),
@@ -253,6 +252,15 @@ def test_nan_from_the_network_is_named(sd21: Path) -> None:
 )
 def test_the_number_format_follows_device_and_size(name: str, device: str, size: int, dtype: torch.dtype) -> None:
     assert choose_dtype(name, torch.device(device), size) == dtype
+
+
+@pytest.mark.parametrize(("capability", "dtype"), [("AVX512", torch.bfloat16), ("AVX2", torch.float32)])
+def test_large_models_are_halved_where_the_cpu_is_fast_at_it(
+    capability: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    assert choose_dtype("auto", torch.device("cpu"), 2 << 30) == dtype
+    assert choose_dtype("auto", torch.device("cpu"), 1 << 20) == torch.float32
 
 
 def test_half_precision_on_a_cpu_is_a_usage_error(sd21: Path) -> None:

@@ -23,7 +23,7 @@ from gsopt.finetune.on_views.sheet import sheet
 from gsopt.finetune.on_views.training import STATE, Training
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.sds.choice import EMBEDDED
-from gsopt.sds.diffusers_prior import LARGE, DiffusersPrior, choose_device
+from gsopt.sds.diffusers_prior import LARGE, DiffusersPrior, choose_device, has_bfloat16
 from gsopt.sds.folder import REMEDIES, DiffusersFolder, find_folder
 from gsopt.sds.view_prior import is_view_prior
 
@@ -106,9 +106,9 @@ def open_base(folder: DiffusersFolder, study: Study, how: Preparation) -> Diffus
     device = choose_device(study.device)
     dtype = study.dtype
     if dtype == "auto":
-        large = device.type != "cpu" or folder.unet_bytes >= LARGE
-        half = large and not study.full and (device.type == "cpu" or torch.cuda.is_bf16_supported())
-        dtype = "bfloat16" if half else "float32"
+        on_cpu = device.type == "cpu"
+        half = folder.unet_bytes >= LARGE and has_bfloat16() if on_cpu else torch.cuda.is_bf16_supported()
+        dtype = "bfloat16" if half and not study.full else "float32"
     return DiffusersPrior(folder, GuidanceConfig(size=how.size, dtype=dtype, device=study.device))
 
 

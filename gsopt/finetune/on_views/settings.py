@@ -32,7 +32,8 @@ class Study:
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
     dtype: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Of the frozen weights. auto: bfloat16 on a GPU and for large models, else float32. What is trained is float32."""
+    """Of the frozen weights. auto: bfloat16 on a GPU, and for large models on a CPU with AVX-512, else float32.
+    What is trained is float32."""
 
     def __post_init__(self) -> None:
         check.at_least("--steps", self.steps, 0, "A few hundred are usual.")
