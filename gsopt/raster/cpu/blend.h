@@ -75,7 +75,7 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
       if (frame.skips.termination) alive &= ~finished;
     }
   }
-  std::memset(masks + k, 0, sizeof(uint32_t) * (end - k));
+  for (; k < end; ++k) masks[k] = 0;  // a loop: where there are no splats there is no memory, and memset must have some
   float* T = frame.transmittance.as<float>() + static_cast<int64_t>(tile) * kBlocks * kPixels;
   int32_t* last = frame.last.as<int32_t>() + static_cast<int64_t>(tile) * kBlocks * kPixels;
   for (int block = 0; block < kBlocks; ++block) {
