@@ -1,6 +1,6 @@
 # make demo: train on the scene that ships with gsopt and write a report.
 # make test: lint, type-check and test.   make lint: only the first two.
-# make bench: measure kernels and scenes.   make stress, make sanitize: the slow checks of the rasterizer.
+# make bench: measure kernels and scenes.   make stress: the slow checks of the rasterizer.
 # Each makes .venv when it is missing and installs again when pyproject.toml, constraints.txt or the C++ sources change.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -27,6 +27,7 @@ demo: $(VENV)/.for-demo
 
 test: lint
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2
+	$(MAKE) sanitize
 
 # Rewrites docs/performance.md and what it quotes; an hour. Alone on the machine the wall times mean something.
 # What every skip saves takes hours and data of its own: python benchmarks/skips.py --root DATA --draw.
@@ -42,7 +43,7 @@ stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
 # The tests of the kernels on a build that stops at the first bad address or undefined behavior. -S and -P: neither the
-# editable install nor the sources are to be imported instead of it.
+# editable install nor the sources are to be imported instead of it; --capture=sys: what a sanitizer says is to be seen.
 sanitize: $(VENV)/.for-test
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
 	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" .
@@ -50,7 +51,7 @@ sanitize: $(VENV)/.for-test
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 \
 	  PYTHONPATH="build/sanitized:$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"; \
 	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
-	$(PY) -S -P -m pytest tests/raster tests/init/stereo/test_matching.py
+	$(PY) -S -P -m pytest --capture=sys tests/raster tests/init/stereo/test_matching.py
 
 # A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 8 GB of memory.
 test-sd21: $(VENV)/.for-test
