@@ -23,7 +23,7 @@ LARGEST_WEIGHT = 1000.0
 VIEWS = ("all", "front", "side", "back", "top")
 POLARITIES = ("positive", "negative")
 DOMAINS = ("generic", "medicine", "robotics", "arvr", "environment")
-FILE = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+FILE = re.compile(r"(\w[\w .-]{0,99}/)?\w[\w .-]{0,99}")
 """Beside the file or one folder below."""
 SOURCE = re.compile(r"user|template|llm:[^\s<>]{1,200}")
 

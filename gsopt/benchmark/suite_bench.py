@@ -53,9 +53,9 @@ def _one(path: Path, document: dict[str, Any], case: Case, bench: Bench) -> tupl
             return document, ""
         document = suite_file.with_skip(document, skip)
     else:
-        if old is not None and old["key"] == suite_run.key(case, bench):
-            return document, ""
         try:
+            if old is not None and old["key"] == suite_run.key(case, bench):
+                return document, ""
             record, protocol, pictures = suite_run.measure(case, bench)
         except RunFailed as error:
             return document, f"{case.id} failed: {error}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -121,11 +122,13 @@ def prompts(case: Case, bench: Bench) -> Path | None:
     """The arm's prompts.json, made once per scene; None for an arm without words."""
     if case.arm not in suite_arms.WORDS:
         return None
-    path = bench.work / "prompts" / f"{case.scene.replace('/', '-')}-{case.arm}.json"
+    note = notes(bench.root)[case.scene]
+    asked = hashlib.sha256(json.dumps([note, bench.llm, bench.model, suite_key.code_hash()]).encode()).hexdigest()[:12]
+    path = bench.work / "prompts" / f"{case.scene.replace('/', '-')}-{case.arm}-{asked}.json"
     if path.exists():
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    note, every = notes(bench.root)[case.scene], path.with_name(f"all-{path.name}")
+    every = path.with_name(f"all-{path.name}")
     command = ["prompts", "--notes", str(note["notes"]), "--domain", str(note.get("domain", "generic"))]
     command += ["--category", str(note["category"])] if "category" in note else []
     command += ["--llm", bench.llm, "--model", bench.model] if case.arm == "ours-llm" else []

@@ -241,7 +241,9 @@ def suite(flags: Suite) -> int:
     from gsopt.benchmark.suite_run import Bench
 
     output = flags.output.absolute()
-    bench = Bench(root, work_folder(output), flags.threads, flags.prior, flags.llm, flags.model)
+    folder = Path(flags.prior or "").expanduser()  # a run starts in another folder; any other name is an id
+    prior = str(folder.absolute()) if flags.prior and folder.is_dir() else flags.prior
+    bench = Bench(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
     command = suite_command(flags)
     failed = run_suite(output, whole.name, command, cases, bench, lambda text: print(text, flush=True))
     drawn = output.with_suffix(".html")

@@ -96,7 +96,10 @@ def whole_scene(folder: Path, size: int) -> Scene:
     full = load_scene(DataConfig(path=str(folder)))
     side = min(min(view.camera.width, view.camera.height) for view in full.train)
     scene = load_scene(DataConfig(path=str(folder), downscale=max(1, side // size)))
-    return replace(scene, train=scene.train + scene.test, test=())
+    views = scene.train + scene.test
+    if len(views) < 2:
+        raise InputError(f"{folder} has one view; one to learn from and one to look at are needed. Leave it out.")
+    return replace(scene, train=views, test=())
 
 
 def _dealt(scene: Scene, random: torch.Generator) -> tuple[list[View], list[View]]:

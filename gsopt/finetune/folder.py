@@ -32,7 +32,6 @@ def write_folder(
     write_atomic(out / "unet" / "config.json", to_json(config))
     for file in (out / "unet").iterdir():
         file.chmod(READABLE)  # diffusers writes weights that only their owner may read
-    write_atomic(out / CARD, to_json({"size": lessons.size, "measured": dict(measured)}))
     index = {"_class_name": "GsoptViewPrior", "unet": ["diffusers", "UNet2DConditionModel"]}
     write_atomic(out / "model_index.json", to_json({**index, "scheduler": ["diffusers", "DDIMScheduler"]}))
     scheduler = {
@@ -46,6 +45,8 @@ def write_folder(
     parameters = sum(value.numel() for value in unet.parameters())
     card = model_card(lessons, course, base, measured, parameters, list(map(_origin, lessons.train)))
     write_atomic(out / "README.md", card.encode())
+    # Last: what has a card is whole.
+    write_atomic(out / CARD, to_json({"size": lessons.size, "measured": dict(measured)}))
 
 
 def _origin(scene: Path) -> dict[str, str]:

@@ -27,7 +27,7 @@ from gsopt.guidance_config import GuidanceConfig
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.sds.choice import EMBEDDED
-from gsopt.sds.view_prior import CARD, CLIP, ViewPrior, is_view_prior, make_deaf, make_unet
+from gsopt.sds.view_prior import CARD, CLIP, ViewPrior, is_view_prior, make_deaf, make_unet, side_multiple
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""
@@ -50,6 +50,9 @@ class Lessons:
     def __post_init__(self) -> None:
         check.at_least("--fits", self.fits, 1, "3 is usual.")
         check.within("--size", self.size, 64, 512, "The default is 128.")
+        if self.size % side_multiple():
+            near = round(self.size / side_multiple()) * side_multiple()
+            raise UsageError(f"`--size` must be a multiple of {side_multiple()}, got {self.size}. Try {near}.")
 
 
 def find_scenes(roots: Sequence[Path], val: Sequence[str]) -> tuple[tuple[Path, ...], tuple[Path, ...]]:

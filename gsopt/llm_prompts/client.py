@@ -88,8 +88,9 @@ def connect(url: str, model: str, timeout: float, environment: Mapping[str, str]
 
 def read_url(url: str) -> str:
     """The base address without a final slash, with /v1 where it has no path."""
-    parts = urllib.parse.urlsplit(url.strip())
+    parts = urllib.parse.SplitResult("", "", "", "", "")
     try:
+        parts = urllib.parse.urlsplit(url.strip())
         sound = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
     except ValueError:
         sound = False

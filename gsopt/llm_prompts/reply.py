@@ -30,7 +30,7 @@ MOST_ENTRIES = 64
 """Per list of a reply."""
 MOST_PROBLEMS = 12
 START = re.compile(r"[{\[]")
-LISTED = re.compile(r"^\s*(?:[-*\u2022]|\(?\d{1,3}[.):])\s+(\S.*)$", re.M)
+LISTED = re.compile(r"^[^\S\n]*(?:[-*\u2022]|\(?\d{1,3}[.):])[^\S\n]+(\S.*)$", re.M)
 THOUGHT = re.compile(r"\A.*</think(?:ing)?>", re.S)
 WHOLE_LIST = ("prompts", "descriptions", "all")
 """Keys under which models put what belongs under `all`."""

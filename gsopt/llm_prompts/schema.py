@@ -41,7 +41,7 @@ MOST_WARNINGS = 64
 View = Literal["all", "front", "side", "back", "top"]
 Polarity = Literal["positive", "negative"]
 SOURCE = re.compile(r"user|template|llm:[^\s<>]{1,200}")
-FILE = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]{0,99}/)?[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+FILE = re.compile(r"(\w[\w .-]{0,99}/)?\w[\w .-]{0,99}")
 """A file beside prompts.json or one folder below it."""
 
 
@@ -270,7 +270,7 @@ def _require_file(value: Any, name: str) -> None:
     if not isinstance(value, str) or not FILE.fullmatch(value):
         raise InputError(
             f"`{name}` must name a file beside prompts.json or one folder below, got {value!r:.80}. Letters, digits, "
-            "dots, - and _ may be used."
+            "spaces, dots, - and _ may be used."
         )
 
 

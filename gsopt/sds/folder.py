@@ -168,6 +168,8 @@ def _require_kinds(folder: DiffusersFolder) -> None:
             f"The U-Net in {folder.path} takes {unet.get('in_channels')} channels and the VAE makes {channels}: an "
             "inpainting, depth or upscaling model, or parts of two models. Give a text-to-image model."
         )
+    if unet.get("cross_attention_dim") and not folder.takes_text:
+        raise InputError(f"{folder.path} lacks text_encoder/, which its U-Net listens to. {REMEDIES}")
     if folder.takes_text:
         width = _read_json(folder.path / "text_encoder" / "config.json").get("hidden_size")
         if unet.get("cross_attention_dim") != width:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from gsopt import cli
 from gsopt.benchmark import results, schema
 from gsopt.benchmark.scenes import Task, front, time_at
+from gsopt.cli import bench
 from gsopt.config import DataConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.presets import PRESETS
@@ -71,7 +72,7 @@ def test_a_page_is_drawn_from_the_file_alone(measured: Path, tmp_path: Path) -> 
 
 def test_a_scene_that_holds_out_nothing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        cli.bench.scenes(cli.bench.Scenes(tmp_path / "x.json", tmp_path), [])
+        bench.scenes(bench.Scenes(tmp_path / "x.json", tmp_path), [])
     file = tmp_path / "kernels.json"
     file.write_text("[]")
     with pytest.raises(InputError, match="must be dict"):

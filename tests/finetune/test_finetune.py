@@ -13,12 +13,13 @@ import pytest
 import torch
 
 from gsopt.cli import main
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 from gsopt.finetune import fits, measure
 from gsopt.finetune.course import Course
-from gsopt.finetune.fits import Pairs, make_pairs
+from gsopt.finetune.fits import Pairs, make_pairs, whole_scene
 from gsopt.finetune.learn import STATE, Training, loss
 from gsopt.finetune.lessons import draw
+from gsopt.finetune.run import Lessons
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.raster.api import make_backend
 from gsopt.sds.opening import open_prior
@@ -148,6 +149,19 @@ def test_the_same_command_goes_on_and_another_is_refused(prior: Path, scenes: Pa
     assert (prior / "README.md").read_bytes() == before
     assert main(command(scenes, prior, "--lr", "1e-3")) == 3
     assert (prior / "README.md").read_bytes() == before
+
+
+@pytest.mark.parametrize("size", [100, 66, 32])
+def test_a_size_that_no_prior_can_have_is_refused_before_any_work(size: int) -> None:
+    with pytest.raises(UsageError, match=r"`--size`"):
+        Lessons((Path("a"),), (), size=size)
+
+
+def test_a_scene_of_one_view_is_named(tmp_path: Path) -> None:
+    scene = write_dataset(tmp_path / "one", train=1, test=1)
+    (scene / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match="one view"):
+        whole_scene(scene, SIZE)
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,8 @@ def test_only_accepted_images_are_given_out(tmp_path: Path) -> None:
         {"images": [{"file": "../a.png"}]},
         {"images": [{"file": "/etc/a.png"}]},
         {"images": [{"file": "a/b/c.png"}]},
+        {"images": [{"file": "../.. /c.png"}]},
+        {"images": [{"file": " /c.png"}]},
         {"images": [{"file": "C:\\a.png"}]},
         {"images": [{"file": "a.png\n"}]},
         {"images": [{"file": "a.png", "accepted": "yes"}]},

@@ -18,6 +18,7 @@ from gsopt import cli
 from gsopt.errors import GsoptError, UsageError
 from gsopt.llm_prompts import client, schema
 from gsopt.llm_prompts.client import connect, find_key, read_url
+from gsopt.llm_prompts.reply import LISTED
 from gsopt.llm_prompts.schema import read_set
 
 pytest.importorskip("pydantic", reason="needs the extra gsopt[llm]")
@@ -228,6 +229,8 @@ def test_an_address_is_read_with_and_without_its_ending(url: str, base: str) -> 
         "ftp://h/v1",
         "http://",
         "http://h:99999/v1",
+        "http://[::1",
+        "http://[x]:1/v1",
         "file:///etc/passwd",
         "http://u:p@h/v1",
         "http://h/v1?key=1",
@@ -237,6 +240,11 @@ def test_an_address_is_read_with_and_without_its_ending(url: str, base: str) -> 
 def test_an_address_that_cannot_be_used_is_a_usage_error(url: str) -> None:
     with pytest.raises(UsageError, match="`--llm`"):
         read_url(url)
+
+
+def test_an_answer_of_newlines_is_read_in_a_moment() -> None:
+    """A search that starts anew at every line takes a quarter of an hour for it."""
+    assert LISTED.findall("\n" * 200_000 + "- a chair\n  2. a table\n-\nno") == ["a chair", "a table"]
 
 
 def test_a_key_goes_to_nobody_it_is_not_for() -> None:

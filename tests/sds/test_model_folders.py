@@ -33,6 +33,7 @@ def only_pickle(part: Path) -> None:
 FAULTS: list[tuple[str, Callable[[Path], object], str]] = [
     ("half a file of weights", lambda f: truncate(f / "unet" / "diffusion_pytorch_model.safetensors"), "incomplete"),
     ("no weights", lambda f: (f / "vae" / "diffusion_pytorch_model.safetensors").unlink(), "holds no weights"),
+    ("no text encoder", lambda f: shutil.rmtree(f / "text_encoder"), "text_encoder"),
     ("no text encoder weights", lambda f: (f / "text_encoder" / "model.safetensors").unlink(), "text_encoder"),
     ("weights as a pickle", lambda f: only_pickle(f / "unet"), "pickle"),
     (
