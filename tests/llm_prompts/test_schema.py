@@ -139,6 +139,15 @@ def test_records_and_committed_schema_refuse_the_same(more: dict[str, Any]) -> N
         set_from(document)
 
 
+@pytest.mark.parametrize(
+    "name", ["a.png", "my prompts-images/001.png", "st\u00fchle.raw.json", "_a-b/c.d.png", "\u6625/1.png"]
+)
+def test_files_may_have_the_names_that_people_give(name: str) -> None:
+    document = {"version": 1, "prompts": [{"text": "a"}], "images": [{"file": name}]}
+    assert json_schema.is_valid(document, COMMITTED)
+    assert set_from(document).images[0].file == name
+
+
 def test_only_the_text_is_needed() -> None:
     assert prompts_from({"version": 1, "prompts": [{"text": "a chair 🪑"}]}) == (Prompt("a chair 🪑"),)
 
