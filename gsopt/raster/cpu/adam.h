@@ -12,10 +12,10 @@ inline void adam_span(const AdamArguments& a, int64_t begin, int64_t n) {
   const float* g = a.grad + begin;
   const float d1 = 1.f - a.beta1, d2 = 1.f - a.beta2;
   int64_t i = 0;
-  for (; i + 8 <= n; i += 8) {
-    const f8 grad = load8(g + i), mean = load8(m + i) * a.beta1 + grad * d1, square = load8(v + i) * a.beta2 + grad * grad * d2;
-    store8(m + i, mean), store8(v + i, square);
-    store8(p + i, load8(p + i) - mean * a.step_size / (sqrt(square) * a.inv_sqrt_correction2 + a.eps));
+  for (; i + kWide <= n; i += kWide) {
+    const wide grad = load_wide(g + i), mean = load_wide(m + i) * a.beta1 + grad * d1, square = load_wide(v + i) * a.beta2 + grad * grad * d2;
+    store_wide(m + i, mean), store_wide(v + i, square);
+    store_wide(p + i, load_wide(p + i) - mean * a.step_size / (sqrt(square) * a.inv_sqrt_correction2 + a.eps));
   }
   for (; i < n; ++i) {
     m[i] = m[i] * a.beta1 + g[i] * d1;

@@ -51,32 +51,29 @@ inline void sort_stage(Pool& pool, Frame& frame) {
   }
 }  // an odd number of passes: the sorted ids are in order2
 
-// First pass: how many tiles each splat has, how many splats each tile has (per chunk of the sorted order).
-inline void count_stage(Pool& pool, Frame& frame, int chunks) {
+// Calls visit(id, cover) for the splats of a part of the sorted order; while it does, the next ones are asked for.
+template <class Visit> inline void for_each_cover(const Frame& frame, int chunk, int chunks, Visit&& visit) {
   const uint32_t* order = frame.order2.as<uint32_t>();
-  Record* records = frame.records.as<Record>();
+  const Cover* covers = frame.covers.as<Cover>();
+  for (int64_t i = frame.visible * chunk / chunks, end = frame.visible * (chunk + 1) / chunks; i < end; ++i) {
+    __builtin_prefetch(&covers[order[i + kAhead < end ? i + kAhead : i]]);
+    visit(order[i], covers[order[i]]);
+  }
+}
+
+// First pass: how many splats each tile has, per chunk of the sorted order.
+inline void count_stage(Pool& pool, Frame& frame, int chunks) {
   uint32_t* counts = frame.histogram.as<uint32_t>();
   const int tiles = frame.tiles();
   parallel(pool, chunks, [&](int chunk, int) {
     uint32_t* mine = counts + static_cast<int64_t>(chunk) * tiles;
     std::memset(mine, 0, sizeof(uint32_t) * tiles);
-    for (int64_t i = frame.visible * chunk / chunks, end = frame.visible * (chunk + 1) / chunks; i < end; ++i) {
-      __builtin_prefetch(&records[order[i + kAhead < end ? i + kAhead : i]], 1);
-      Record& r = records[order[i]];
-      uint32_t n = 0;
-      for_each_tile(frame, r, [&](int tile) { ++mine[tile], ++n; });
-      r.count = n;
-    }
+    for_each_cover(frame, chunk, chunks, [&](uint32_t id, const Cover& cover) { for_each_tile(frame, cover, id, [&](int tile) { ++mine[tile]; }); });
   });
 }
 
-// Prefix sums: slots by Gaussian index, entries by tile and, inside a tile, by chunk. False when there are too many.
-inline bool offset_stage(Frame& frame, int chunks, int64_t max_entries) {
-  Record* records = frame.records.as<Record>();
-  int64_t slot = 0;
-  for (int64_t n = 0; n < frame.count; ++n) records[n].slot = static_cast<uint32_t>(slot), slot += records[n].count;
-  frame.intersections = slot;
-  if (slot > max_entries) return false;
+// Prefix sums: entries by tile and, inside a tile, by chunk.
+inline void offset_stage(Frame& frame, int chunks) {
   uint32_t *counts = frame.histogram.as<uint32_t>(), *tile_begin = frame.tile_begin.as<uint32_t>();
   uint32_t entry = 0;
   for (int tile = 0; tile < frame.tiles(); ++tile) {
@@ -88,34 +85,30 @@ inline bool offset_stage(Frame& frame, int chunks, int64_t max_entries) {
     }
   }
   tile_begin[frame.tiles()] = entry;
-  return true;
 }
 
 inline void fill_stage(Pool& pool, Frame& frame, int chunks) {
-  const uint32_t* order = frame.order2.as<uint32_t>();
-  const Record* records = frame.records.as<Record>();
   uint32_t* counts = frame.histogram.as<uint32_t>();
   Entry* entries = frame.entries.as<Entry>();
   parallel(pool, chunks, [&](int chunk, int) {
     uint32_t* next = counts + static_cast<int64_t>(chunk) * frame.tiles();
-    for (int64_t i = frame.visible * chunk / chunks, end = frame.visible * (chunk + 1) / chunks; i < end; ++i) {
-      __builtin_prefetch(&records[order[i + kAhead < end ? i + kAhead : i]]);
-      const Record& r = records[order[i]];
-      uint32_t slot = r.slot;
-      for_each_tile(frame, r, [&](int tile) { entries[next[tile]++] = {order[i], slot++}; });
-    }
+    for_each_cover(frame, chunk, chunks, [&](uint32_t id, const Cover& cover) {
+      uint32_t slot = cover.slot;
+      for_each_tile(frame, cover, id, [&](int tile) { entries[next[tile]++] = {id, slot++}; });
+    });
   });
 }
 
 // False, and no entries, when there would be more than `max_entries`.
 inline bool bin_stage(Pool& pool, Frame& frame, int64_t max_entries) {
+  if (frame.intersections > max_entries) return false;
   const int chunks = frame.visible < 4096 ? 1 : pool.threads();
   const size_t sort_bytes = sizeof(uint32_t) * kRadix * divide_up(frame.visible, kSortChunk);
   const size_t count_bytes = sizeof(uint32_t) * frame.tiles() * static_cast<size_t>(chunks);
   frame.histogram.reserve(sort_bytes > count_bytes ? sort_bytes : count_bytes);
   sort_stage(pool, frame);
   count_stage(pool, frame, chunks);
-  if (!offset_stage(frame, chunks, max_entries)) return false;
+  offset_stage(frame, chunks);
   frame.entries.reserve(sizeof(Entry) * frame.intersections);
   frame.masks.reserve(sizeof(uint32_t) * frame.intersections);
   fill_stage(pool, frame, chunks);

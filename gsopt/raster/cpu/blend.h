@@ -1,44 +1,76 @@
-// Stage 3: front-to-back compositing. Splat by splat, and for each twice over the blocks that it touches: its alphas, then
-// what they do to the pixels. Blocks do not wait for each other, so the processor works on several at once; but it looks
-// only some hundred instructions ahead, and in one long loop it would find too few blocks there.
+// Stage 3: front-to-back compositing, block by block: what its pixels have become stays in registers while the splats that touch
+// it pass by, a batch at a time: first their alphas, which do not wait for each other, then what they do to the pixels.
 #pragma once
+#include "blocks.h"
 #include "parallel.h"
-#include "tile.h"
 
 namespace gsopt::GSOPT_ISA {
+
+constexpr int kBatch = 8;  // splats; a block whose pixels are all opaque is left at the end of one
 
 // What a block's pixels have become so far.
 struct alignas(64) BlockState {
   float T[kPixels], r[kPixels], g[kPixels], b[kPixels], depth[kPixels];
-  int32_t last[kPixels];  // entry of the tile that contributed last, -1 if none
+  int32_t last[kPixels];  // number in the tile, from 1, of the last splat that found it not opaque; 0 if none
 };
 
-// Blends splat `i` of a chunk, entry `index` of its tile, into the blocks of `mask`. Returns the blocks that terminated.
-template <bool Depth, bool Count>
-inline uint32_t blend_splat(const Local& local, int i, int index, uint32_t mask, BlockState* states, Work& work) {
-  const Local::Row& row = local.row[i];
-  const px r = splat<px>(row.r), g = splat<px>(row.g), b = splat<px>(local.b[i]), depth = splat<px>(local.depth[i]);
-  const px t_min = splat<px>(kTransmittanceMin);
-  const pxi here = splat_pxi(index);
-  Alphas alphas;
-  alphas_of<false>(Spread(row), mask, alphas);
-  uint32_t finished = 0;
-  int n = 0;
-  for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
-    BlockState& s = states[__builtin_ctz(rest)];
-    const px T = load_px(s.T);
-    const pxi alive = T > t_min;
-    const px weight = alphas.alpha[n] * keep(alive, T);
-    store_px(s.T, T - weight);
-    store_px(s.r, load_px(s.r) + weight * r);
-    store_px(s.g, load_px(s.g) + weight * g);
-    store_px(s.b, load_px(s.b) + weight * b);
-    if (Depth) store_px(s.depth, load_px(s.depth) + weight * depth);
-    store_pxi(s.last, max(load_pxi(s.last), alive & here));
-    finished |= any(alive) ? 0 : rest & -rest;
-    if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(weight > splat<px>(0.f)));
+// The alphas of n splats at the pixels of a block; 0 where they are not drawn.
+inline void alphas_of(const Local& local, const Touched& touched, const uint8_t* list, int n, int block, px alphas[kBatch]) {
+  const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
+  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
+  for (int j = 0; j < n; ++j) {
+    const int i = list[j];
+    const Local::Row& s = local.row[i];
+    const px u = splat<px>(s.A) * X + (splat<px>(s.B) * Y + splat<px>(touched.u0[i])), v = splat<px>(s.C) * Y + splat<px>(touched.v0[i]);
+    const px e = splat<px>(s.log2_opacity) - v * v - u * u;
+    alphas[j] = keep(e >= threshold, min(exp2(e), alpha_max));
   }
-  return finished;
+}
+
+// Blends the splats of a list into a block, `first` being the number of the chunk's first splat. True when all its pixels
+// have become opaque.
+template <bool Depth, bool Count>
+inline bool blend_block(const Local& local, const Touched& touched, const SplatList& list, int first, int block, bool stop, BlockState& s, Work& work) {
+  const px t_min = splat<px>(kTransmittanceMin);
+  // T goes on behind the splat at which a pixel became opaque, so that no splat waits for that; T_end does not.
+  px T = load_px(s.T), T_end = T, r = load_px(s.r), g = load_px(s.g), b = load_px(s.b), depth = load_px(s.depth);
+  pxi last = load_pxi(s.last);
+  px alphas[kBatch];
+  bool opaque = false;
+  for (int begin = 0; begin < list.count && !opaque; begin += kBatch) {
+    const int n = list.count - begin < kBatch ? list.count - begin : kBatch;
+    alphas_of(local, touched, list.at + begin, n, block, alphas);
+    for (int j = 0; j < n; ++j) {
+      const int i = list.at[begin + j];
+      const pxi alive = T > t_min;
+      const px alpha = alphas[j], weight = keep(alive, alpha) * T;
+      T = T - alpha * T;
+      T_end = select(alive, T, T_end), last = select(alive, splat_pxi(first + i), last);
+      r = r + weight * splat<px>(local.row[i].r), g = g + weight * splat<px>(local.row[i].g), b = b + weight * splat<px>(local.b[i]);
+      if (Depth) depth = depth + weight * splat<px>(local.depth[i]);
+      if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(weight > splat<px>(0.f)));
+    }
+    T = keep(T > t_min, T);
+    opaque = stop && !any(T > t_min);
+  }
+  store_px(s.T, T_end), store_px(s.r, r), store_px(s.g, g), store_px(s.b, b), store_px(s.depth, depth), store_pxi(s.last, last);
+  return opaque;
+}
+
+// Blends a chunk of n splats, `first` being the number of the first in its tile. Returns the blocks that are not opaque yet;
+// `touched` keeps the blocks that each splat changed.
+template <bool Depth, bool Count>
+inline uint32_t blend_chunk(const Local& local, int n, int first, uint32_t alive, bool stop, Touched& touched, BlockState* states, Work& work) {
+  SplatList list;
+  for (uint32_t rest = alive; rest; rest &= rest - 1) {
+    const int block = __builtin_ctz(rest);
+    list_splats(touched, n, block, list);
+    if (!blend_block<Depth, Count>(local, touched, list, first, block, stop, states[block], work)) continue;
+    alive &= ~(1u << block);
+    const int last = most(load_pxi(states[block].last)) - first;
+    for (int k = list.count; k > 0 && list.at[k - 1] > last; --k) touched.blocks[list.at[k - 1]] &= ~(1u << block);
+  }
+  return alive;
 }
 
 inline void write_block(const Frame& frame, const ForwardOutput& out, int tile, int block, const BlockState& s) {
@@ -63,17 +95,16 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
       alive |= 1u << block;
     });
   Local local;
-  alignas(64) uint32_t touched[kChunk];
+  Touched touched;
   uint32_t k = begin;
-  for (uint32_t first = begin; first < end && alive; first += kChunk) {
-    const int n = end - first < kChunk ? static_cast<int>(end - first) : kChunk;
-    load_chunk(frame, frame.entries.as<Entry>() + first, n, geometry, local);
-    touched_blocks(local, n, touched);
-    for (int i = 0; i < n && alive; ++i, ++k) {
-      masks[k] = (frame.skips.tiles ? touched[i] : ~0u) & alive;
-      const uint32_t finished = blend_splat<Depth, Count>(local, i, static_cast<int>(k - begin) + 1, masks[k], states, work);
-      if (frame.skips.termination) alive &= ~finished;
-    }
+  while (k < end && alive) {
+    const int n = end - k < kChunk ? static_cast<int>(end - k) : kChunk;
+    load_chunk(frame, frame.entries.as<Entry>() + k, n, geometry, local);
+    prefetch_records(frame, k + n, k + n + kChunk);
+    find_touched(local, n, alive, !frame.skips.tiles, touched);
+    alive = blend_chunk<Depth, Count>(local, n, static_cast<int>(k - begin) + 1, alive, frame.skips.termination, touched, states, work);
+    std::memcpy(masks + k, touched.blocks, sizeof(uint32_t) * n);
+    k += n;
   }
   for (; k < end; ++k) masks[k] = 0;  // a loop: where there are no splats there is no memory, and memset must have some
   float* T = frame.transmittance.as<float>() + static_cast<int64_t>(tile) * kBlocks * kPixels;

@@ -35,6 +35,39 @@ inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile,
   });
 }
 
+// One splat with its numbers spread over the lanes, and its exponent at a block's pixels:
+// exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
+struct Spread {
+  px A, B, C, u0, v0, log2_opacity;
+  explicit Spread(const Local::Row& r)
+      : A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), u0(splat<px>(-(r.A * r.x + r.B * r.y))), v0(splat<px>(-r.C * r.y)),
+        log2_opacity(splat<px>(r.log2_opacity)) {}
+};
+struct Exponent {
+  px u, v, e;
+};
+inline Exponent exponent(const Spread& s, int block) {
+  const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
+  Exponent out;
+  out.u = s.A * X + (s.B * Y + s.u0), out.v = s.C * Y + s.v0;
+  out.e = s.log2_opacity - out.v * out.v - out.u * out.u;  // v is ready first
+  return out;
+}
+
+// The alphas of one splat at the pixels of the blocks of a mask, one block after the other; 0 where they are not drawn.
+struct Alphas {
+  px alpha[kBlocks], u[kBlocks], v[kBlocks];
+};
+inline void alphas_of(const Spread& splat_i, uint32_t mask, Alphas& out) {
+  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
+  int n = 0;
+  for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
+    const Exponent x = exponent(splat_i, __builtin_ctz(rest));
+    out.alpha[n] = keep(x.e >= threshold, min(exp2(x.e), alpha_max));
+    out.u[n] = x.u, out.v[n] = x.v;
+  }
+}
+
 // The row of splat `i` of a chunk, entry `index` (one-based) of its tile, over the blocks of `mask`.
 template <bool Depth, bool Abs>
 inline void blend_splat_backward(const Local& local, int i, int index, uint32_t mask, BlockGradient* grads, float* row) {
@@ -44,7 +77,7 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
   const px one = splat<px>(1.f), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
-  alphas_of<true>(Spread(splat_i), mask, alphas);
+  alphas_of(Spread(splat_i), mask, alphas);
   px* s_of = alphas.alpha;  // written over the alphas, which no one needs again
   px wr = zero, wg = zero, wb = zero, wz = zero;
   int n = 0;
@@ -66,9 +99,8 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
     s0 = s0 + s, su = su + s_u, sv = sv + s_v, suu = suu + s_u * u, suv = suv + s_u * v, svv = svv + s_v * v;
     if (Abs) abs_x = abs_x + abs(s_u), abs_y = abs_y + abs(B * s_u + C * s_v);
   }
-  store8(row, sums(s0, su, sv, suu, suv, svv, wr, wg));
-  const float scale = 1.f / kHalfLog2E;
-  store8(row + 8, f8{sum(wb), Depth ? sum(wz) : 0.f, Abs ? sum(abs_x) * splat_i.A * scale : 0.f, Abs ? sum(abs_y) * scale : 0.f, 0.f, 0.f, 0.f, 0.f});
+  const px scale = splat<px>(1.f / kHalfLog2E);
+  store_sums(row, {s0, su, sv, suu, suv, svv, wr, wg, wb, wz, abs_x * splat<px>(splat_i.A) * scale, abs_y * scale});
 }
 
 template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& frame, int tile, const BackwardInput& in) {
@@ -84,6 +116,7 @@ template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& fra
   for (int chunk = divide_up(end - begin, kChunk) - 1; chunk >= 0; --chunk) {
     const int first = chunk * kChunk, rest = static_cast<int>(end - begin) - first, n = rest < kChunk ? rest : kChunk;
     load_chunk(frame, entries + first, n, geometry, local);
+    prefetch_records(frame, static_cast<int64_t>(begin) + first - kChunk, static_cast<int64_t>(begin) + first);
     for (int i = n - 1; i >= 0; --i) {
       __builtin_prefetch(row_of(first + (i >= kRowsAhead ? i - kRowsAhead : 0)), 1);
       float* row = row_of(first + i);
@@ -100,7 +133,7 @@ inline void blend_backward_stage(Pool& pool, Frame& frame, const BackwardInput& 
   const bool depth = in.v_depths != nullptr;
   const auto tile_backward = depth ? (absgrad ? blend_tile_backward<true, true> : blend_tile_backward<true, false>)
                                    : (absgrad ? blend_tile_backward<false, true> : blend_tile_backward<false, false>);
-  parallel(pool, frame.tiles(), [&](int tile, int) { tile_backward(frame, tile, in); });
+  parallel(pool, frame.tiles(), [&](int item, int) { tile_backward(frame, frame.tiles() - 1 - item, in); });
 }
 
 }  // namespace gsopt::GSOPT_ISA

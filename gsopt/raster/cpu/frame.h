@@ -34,10 +34,23 @@ struct alignas(64) Record {
   float mx, my, A, B, C, log2_opacity, r, g;
   float b, depth;
   uint16_t x0, x1, y0, y1;  // tiles, half open
-  uint32_t slot, count;     // its intersections with tiles: rows [slot, slot + count) of the gradient buffer
-  uint64_t tiles;           // which tiles of a small box it touches (cpu/tiles.h)
 };
 static_assert(sizeof(Record) == 64);
+
+// The tiles of a splat, in little memory: they are asked for in an order that no cache foresees.
+struct Cover {
+  uint64_t tiles;   // which of a small box it touches (cpu/tiles.h)
+  uint16_t x0, y0;  // where that box begins, or kAskRecord twice
+  uint32_t slot;    // its intersections are the rows [slot, slot of the next) of the gradient buffer
+};
+static_assert(sizeof(Cover) == 16);
+constexpr uint16_t kAskRecord = 0xffff;
+
+// What kProjectChunk Gaussians brought: visible splats, intersections.
+struct Found {
+  uint32_t visible;
+  int64_t intersections;
+};
 
 // One splat in one tile.
 struct Entry {
@@ -71,14 +84,16 @@ struct Frame {
   bool depth = false;
   Skips skips;
   Buffer records;            // Record[count]
+  Buffer covers;             // Cover[count + 1]
   Buffer keys, order;        // uint32[count]: depth bits, ids, sorted front to back
   Buffer keys2, order2;      // scratch of the sort
-  Buffer histogram, chunks;  // scratch of sort and binning
+  Buffer histogram;          // scratch of sort and binning
+  Buffer found;              // Found[chunks]: scratch of projection
   Buffer tile_begin;         // uint32[tiles + 1]: first entry of a tile
   Buffer entries;            // Entry[intersections]
   Buffer masks;              // uint32[intersections]: bit b: the splat changed block b of the tile
   Buffer transmittance;      // float[tiles][blocks][pixels]
-  Buffer last;               // int32[tiles][blocks][pixels]: last contributing entry of the tile, -1 if none
+  Buffer last;               // int32[tiles][blocks][pixels]: number in the tile, from 1, of the last splat that counts; 0: none
   Buffer rows;               // float[intersections][kRow]
   int tiles() const { return tiles_x * tiles_y; }
 };

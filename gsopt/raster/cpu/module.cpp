@@ -146,7 +146,8 @@ Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, i
 void reserve_frame(Frame& f, int64_t n) {
   f.records.reserve(sizeof(Record) * (n + 1));
   for (Buffer* b : {&f.keys, &f.order, &f.keys2, &f.order2}) b->reserve(sizeof(uint32_t) * (n + kProjectChunk));
-  f.chunks.reserve(sizeof(uint32_t) * (n / kProjectChunk + 1));
+  f.covers.reserve(sizeof(Cover) * (n + 1));
+  f.found.reserve(sizeof(Found) * (n / kProjectChunk + 1));
   f.tile_begin.reserve(sizeof(uint32_t) * (f.tiles() + 1));
   for (Buffer* b : {&f.transmittance, &f.last}) b->reserve(sizeof(float) * kTile * kTile * static_cast<size_t>(f.tiles()));
 }

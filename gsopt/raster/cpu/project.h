@@ -40,8 +40,14 @@ inline f4 sh_color(const Parameters& P, int64_t n, const float Y[][kLanes], int 
   return c;
 }
 
-// One vector of Gaussians; returns how many ids were appended to `ids`.
-inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, uint32_t* ids) {
+// Where a chunk of Gaussians leaves the ids and depth keys of those that are visible, in index order.
+struct Visible {
+  uint32_t *ids, *keys;
+  Found found;
+};
+
+// One vector of Gaussians.
+inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, Visible& visible) {
   const Camera& cam = frame.camera;
   int64_t index[kLanes];
   for (int l = 0; l < kLanes; ++l) index[l] = first + (l < lanes ? l : 0);
@@ -76,48 +82,57 @@ inline int project_lanes(const Frame& frame, const Parameters& P, int64_t first,
     if (mask >> l & 1) boxes[l] = tile_box(frame, out[0][l], out[1][l], rad[0][l], rad[1][l]);
   if (mask && frame.skips.tiles) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);
   Record* records = frame.records.as<Record>();
-  int found = 0;
+  Cover* covers = frame.covers.as<Cover>();
   for (int l = 0; l < lanes; ++l) {
-    Record& r = records[first + l];
-    r.count = 0;
+    const uint32_t id = static_cast<uint32_t>(first + l);
     radii[2 * (first + l)] = radii[2 * (first + l) + 1] = 0;
+    covers[id] = {};
     if (!(mask >> l & 1)) continue;
+    Record& r = records[id];
     const f4 c = sh_color(P, first + l, Y, l, bands);
     r.mx = out[0][l], r.my = out[1][l], r.A = out[2][l], r.B = out[3][l], r.C = out[4][l], r.log2_opacity = out[5][l];
     r.r = c[0] > 0.f ? c[0] : 0.f, r.g = c[1] > 0.f ? c[1] : 0.f, r.b = c[2] > 0.f ? c[2] : 0.f, r.depth = out[6][l];
     r.x0 = static_cast<uint16_t>(boxes[l].x0), r.x1 = static_cast<uint16_t>(boxes[l].x1);
-    r.y0 = static_cast<uint16_t>(boxes[l].y0), r.y1 = static_cast<uint16_t>(boxes[l].y1), r.tiles = tiles[l];
+    r.y0 = static_cast<uint16_t>(boxes[l].y0), r.y1 = static_cast<uint16_t>(boxes[l].y1);
+    covers[id] = cover_of(frame, id, boxes[l], tiles[l]);
     for (int a = 0; a < 2; ++a) radii[2 * (first + l) + a] = clamp_int(__builtin_ceilf(rad[a][l]), 1 << 30);
-    ids[found++] = static_cast<uint32_t>(first + l);
+    visible.ids[visible.found.visible] = id;
+    std::memcpy(&visible.keys[visible.found.visible++], &r.depth, 4);  // positive floats sort like their bits
+    visible.found.intersections += covers[id].slot;
   }
-  return found;
 }
 
-// Fills records and radii, and leaves ids and depth keys of the visible Gaussians, in index order, for the sort.
+// Fills records, covers and radii, and leaves ids and depth keys of the visible Gaussians, in index order, for the sort.
 inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t* radii) {
   const int chunks = divide_up(P.count, kProjectChunk);
-  uint32_t *ids = frame.order2.as<uint32_t>(), *found = frame.chunks.as<uint32_t>();
+  uint32_t *ids = frame.order2.as<uint32_t>(), *keys = frame.keys2.as<uint32_t>();
+  Found* found = frame.found.as<Found>();
+  const auto end_of = [&](int64_t begin) { return begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count; };
   parallel(pool, chunks, [&](int chunk, int) {
-    const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
-    const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
-    uint32_t n = 0;
-    for (int64_t i = begin; i < end; i += kLanes) {
-      const int lanes = end - i < kLanes ? static_cast<int>(end - i) : kLanes;
-      n += project_lanes(frame, P, i, lanes, radii, ids + begin + n);
-    }
-    found[chunk] = n;
+    const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk, end = end_of(begin);
+    Visible visible = {ids + begin, keys + begin, {}};
+    for (int64_t i = begin; i < end; i += kLanes) project_lanes(frame, P, i, end - i < kLanes ? static_cast<int>(end - i) : kLanes, radii, visible);
+    found[chunk] = visible.found;
   });
-  int64_t total = 0;
-  uint32_t *keys = frame.keys.as<uint32_t>(), *order = frame.order.as<uint32_t>();
-  const Record* records = frame.records.as<Record>();
-  for (int chunk = 0; chunk < chunks; ++chunk) {
-    for (uint32_t k = 0; k < found[chunk]; ++k, ++total) {
-      const uint32_t id = ids[static_cast<int64_t>(chunk) * kProjectChunk + k];
-      order[total] = id;
-      std::memcpy(&keys[total], &records[id].depth, 4);  // positive floats sort like their bits
-    }
+  frame.visible = frame.intersections = 0;
+  for (int chunk = 0; chunk < chunks; ++chunk) {  // from here on: what came before
+    const Found mine = found[chunk];
+    found[chunk] = {static_cast<uint32_t>(frame.visible), frame.intersections};
+    frame.visible += mine.visible, frame.intersections += mine.intersections;
   }
-  frame.visible = total;
+  Cover* covers = frame.covers.as<Cover>();
+  parallel(pool, chunks, [&](int chunk, int) {
+    const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk, end = end_of(begin), to = found[chunk].visible;
+    const size_t n = static_cast<size_t>((chunk + 1 < chunks ? found[chunk + 1].visible : frame.visible) - to);
+    std::memcpy(frame.order.as<uint32_t>() + to, ids + begin, sizeof(uint32_t) * n);
+    std::memcpy(frame.keys.as<uint32_t>() + to, keys + begin, sizeof(uint32_t) * n);
+    uint32_t slot = static_cast<uint32_t>(found[chunk].intersections);
+    for (int64_t i = begin; i < end; ++i) {
+      const uint32_t count = covers[i].slot;
+      covers[i].slot = slot, slot += count;
+    }
+  });
+  covers[P.count].slot = static_cast<uint32_t>(frame.intersections);
 }
 
 // dLoss/d(shN row) = Y ⊗ dLoss/dcolor; returns dLoss/d(direction) before normalisation.
@@ -144,11 +159,11 @@ inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (
   v_direction[2] = dz[0] * v[0] + dz[1] * v[1] + dz[2] * v[2];
 }
 
-// The rows of one splat, summed in slot order; false when all are zero: it is in the image, but hidden.
-inline bool sum_rows(const Frame& frame, const Record& record, float out[kRow]) {
-  const float* row = frame.rows.as<float>() + static_cast<int64_t>(record.slot) * kRow;
+// The rows of one splat, summed in slot order; false when all are zero, or there are none: no pixel saw it.
+inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
+  const float* row = frame.rows.as<float>() + static_cast<int64_t>(cover->slot) * kRow;
   f8 a = splat<f8>(0.f), b = a;
-  for (uint32_t k = 0; k < record.count; ++k, row += kRow) a += load8(row), b += load8(row + 8);
+  for (uint32_t k = cover[0].slot; k < cover[1].slot; ++k, row += kRow) a += load8(row), b += load8(row + 8);
   store8(out, a), store8(out + 8, b);
   return any((a != 0.f) | (b != 0.f));
 }
@@ -219,7 +234,7 @@ inline void zero_gradient(const Parameters& P, const ParameterGradients& G, int6
 
 // Gaussians that no pixel saw get zeros; the others are packed into full vectors, in index order.
 inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P, const ParameterGradients& G) {
-  const Record* records = frame.records.as<Record>();
+  const Cover* covers = frame.covers.as<Cover>();
   parallel(pool, divide_up(P.count, kProjectChunk), [&](int chunk, int) {
     const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
     const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
@@ -227,7 +242,7 @@ inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P
     alignas(64) float sums[kLanes][kRow] = {};
     int lanes = 0;
     for (int64_t n = begin; n < end; ++n) {
-      if (records[n].count == 0 || !sum_rows(frame, records[n], sums[lanes])) {
+      if (!sum_rows(frame, &covers[n], sums[lanes])) {
         zero_gradient(P, G, n);
         continue;
       }

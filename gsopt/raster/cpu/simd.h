@@ -2,6 +2,7 @@
 // operator. 8 lanes hold Gaussians; 8, or with GSOPT_SIXTEEN 16, hold the pixels of a block.
 // Included once per instruction set; everything lives in that set's own namespace.
 #pragma once
+#include <bit>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -83,6 +84,15 @@ inline float sum(f8 a) {
   return a[0] + a[1];
 }
 
+// The largest lane.
+inline int most(i8 a) {
+  a = max(a, __builtin_shufflevector(a, a, 4, 5, 6, 7, 0, 1, 2, 3));
+  a = max(a, __builtin_shufflevector(a, a, 2, 3, 0, 1, 6, 7, 4, 5));
+  return a[0] > a[1] ? a[0] : a[1];
+}
+
+inline i8 select(i8 m, i8 a, i8 b) { return (i8)select(m, (f8)a, (f8)b); }
+
 inline i8 shift_exponent(i8 n) { return n << 23; }
 
 #if defined(GSOPT_SIXTEEN)
@@ -96,6 +106,10 @@ inline i16 bits(f16 v) { return (i16)v; }
 inline f16 from_bits(i16 v) { return (f16)v; }
 inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
 inline i16 both(i16 m, i16 n) { return m & n; }
+inline f16 select(i16 m, f16 a, f16 b) { return m ? a : b; }
+inline i16 select(i16 m, i16 a, i16 b) { return m ? a : b; }
+inline i16 to_int(f16 v) { return __builtin_convertvector(v, i16); }  // truncates
+inline f16 joined(f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
 inline i16 shift_exponent(i16 n) { return n << 23; }
 inline f8 low_half(f16 a) { return __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7); }
@@ -103,16 +117,27 @@ inline f8 high_half(f16 a) { return __builtin_shufflevector(a, a, 8, 9, 10, 11, 
 inline f8 fold(f16 a) { return low_half(a) + high_half(a); }
 inline float sum(f16 a) { return sum(fold(a)); }
 #if defined(__AVX512F__)
+inline f16 sqrt(f16 a) { return (f16)_mm512_sqrt_ps((__m512)a); }
+inline f16 sqrt_near(f16 a) { return (f16)_mm512_rsqrt14_ps((__m512)a) * a; }
+inline f16 max(f16 a, f16 b) { return (f16)_mm512_max_ps((__m512)a, (__m512)b); }
+inline i16 shift_left(i16 a, i16 n) { return (i16)_mm512_sllv_epi32((__m512i)a, (__m512i)n); }
 inline f16 min(f16 a, f16 b) { return (f16)_mm512_min_ps((__m512)a, (__m512)b); }
 inline i16 max(i16 a, i16 b) { return (i16)_mm512_max_epi32((__m512i)a, (__m512i)b); }
 inline int movemask(i16 m) { return _mm512_movepi32_mask((__m512i)m); }
 #else
-inline f16 joined(f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
+inline f16 sqrt(f16 a) { return joined(sqrt(low_half(a)), sqrt(high_half(a))); }
+inline f16 sqrt_near(f16 a) { return joined(sqrt_near(low_half(a)), sqrt_near(high_half(a))); }
+inline f16 max(f16 a, f16 b) { return joined(max(low_half(a), low_half(b)), max(high_half(a), high_half(b))); }
+inline i16 shift_left(i16 a, i16 n) {
+  return (i16)joined((f8)shift_left((i8)low_half((f16)a), (i8)low_half((f16)n)), (f8)shift_left((i8)high_half((f16)a), (i8)high_half((f16)n)));
+}
 inline f16 min(f16 a, f16 b) { return joined(min(low_half(a), low_half(b)), min(high_half(a), high_half(b))); }
 inline i16 max(i16 a, i16 b) { return a > b ? a : b; }
 inline int movemask(i16 m) { return movemask((i8)low_half((f16)m)) | movemask((i8)high_half((f16)m)) << 8; }
 #endif
+inline f16 clamp(f16 x, f16 lo, f16 hi) { return min(max(x, lo), hi); }
 inline bool any(i16 m) { return movemask(m) != 0; }
+inline int most(i16 a) { return most(max((i8)low_half((f16)a), (i8)high_half((f16)a))); }
 #endif
 
 // The pixels of a block, one per lane: 4x4 in 16 lanes, 4x2 in 8. Masks are integers, all ones where true.
@@ -133,6 +158,13 @@ inline pxi load_pxi(const int32_t* p) { return load8i(p); }
 inline void store_pxi(int32_t* p, pxi v) { store8i(p, v); }
 inline pxi splat_pxi(int32_t x) { return splat8i(x); }
 #endif
+using wide = px;  // where neither Gaussians nor pixels set the number of lanes
+using widei = pxi;
+inline widei splat_widei(int32_t x) { return splat_pxi(x); }
+inline void store_widei(int32_t* p, widei v) { store_pxi(p, v); }
+inline wide load_wide(const float* p) { return load_px(p); }
+inline void store_wide(float* p, wide v) { store_px(p, v); }
+constexpr int kWide = sizeof(wide) / sizeof(float);
 constexpr int kPixels = sizeof(px) / sizeof(float);  // pixels of a block, always 4 wide
 constexpr int kBlocks = 256 / kPixels;               // blocks of a 16x16 tile
 
@@ -149,6 +181,27 @@ template <class V> inline V exp2(V x) {
   const V p = (high * f2 + mid) * f2 + low;
   return from_bits(bits(p) + shift_exponent(bits(shifted)));
 }
+
+#if defined(GSOPT_SIXTEEN) && defined(__AVX512F__)
+// The same from a table of 2^(i/32), i the low bits of round(32 x), and a polynomial of degree 2 on [-1/64, 1/64]: fewer steps,
+// where one instruction looks up 16 of 32 numbers. The other bits of round(32 x), shifted into the exponent, bring i along
+// into the mantissa; the table has it subtracted.
+struct ExpTable {
+  int32_t of[32];
+  constexpr ExpTable() : of() {
+    double power = 1;
+    for (int i = 0; i < 32; ++i, power *= 1.0218971486541166) of[i] = std::bit_cast<int32_t>(static_cast<float>(power)) - (i << 18);
+  }
+};
+inline constexpr ExpTable kExpTable;
+template <> inline f16 exp2<f16>(f16 x) {
+  const i16 low = *reinterpret_cast<const i16u*>(kExpTable.of), high = *reinterpret_cast<const i16u*>(kExpTable.of + 16);
+  const f16 magic = splat<f16>(393216.f);  // 1.5 * 2^18
+  const f16 shifted = x + magic, f = x - (shifted - magic);
+  const f16 power = from_bits((i16)_mm512_permutex2var_epi32((__m512i)low, (__m512i)bits(shifted), (__m512i)high) + (bits(shifted) << 18));
+  return power + power * (f * (f * splat<f16>(2.402265e-01f) + splat<f16>(6.9315733e-01f)));
+}
+#endif
 
 inline f8 exp(f8 x) { return exp2(clamp(x * splat<f8>(1.44269504089f), splat<f8>(-125.f), splat<f8>(125.f))); }
 
@@ -184,14 +237,63 @@ inline void transpose8(f8 r[8]) {
   }
 }
 
+// kWide rows of eight floats become eight columns.
+#if defined(GSOPT_SIXTEEN)
+inline void load_columns(const float* rows, f16 v[8]) {
+  f16 a[8], b[8];
+  for (int i = 0; i < 8; ++i) v[i] = joined(load8(rows + 8 * i), load8(rows + 8 * (i + 8)));
+  for (int i = 0; i < 8; i += 2) {
+    a[i] = __builtin_shufflevector(v[i], v[i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+    a[i + 1] = __builtin_shufflevector(v[i], v[i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+  }
+  for (int i = 0; i < 8; i += 4) {
+    for (int h = 0; h < 2; ++h) {
+      b[i + 2 * h] = __builtin_shufflevector(a[i + h], a[i + h + 2], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+      b[i + 2 * h + 1] = __builtin_shufflevector(a[i + h], a[i + h + 2], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    }
+  }
+  for (int i = 0; i < 4; ++i) {
+    v[i] = __builtin_shufflevector(b[i], b[i + 4], 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27);
+    v[i + 4] = __builtin_shufflevector(b[i], b[i + 4], 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+  }
+}
+#else
+inline void load_columns(const float* rows, f8 v[8]) {
+  for (int i = 0; i < 8; ++i) v[i] = load8(rows + 8 * i);
+  transpose8(v);
+}
+#endif
+
 inline f8 fold(f8 a) { return a; }
 
-// The sums of the lanes of eight vectors, in one.
-inline f8 sums(px a, px b, px c, px d, px e, px f, px g, px h) {
-  const auto halves = [](f8 x, f8 y) { return __builtin_shufflevector(x, y, 0, 8, 1, 9, 4, 12, 5, 13) + __builtin_shufflevector(x, y, 2, 10, 3, 11, 6, 14, 7, 15); };
-  const auto quarters = [](f8 x, f8 y) { return __builtin_shufflevector(x, y, 0, 1, 8, 9, 4, 5, 12, 13) + __builtin_shufflevector(x, y, 2, 3, 10, 11, 6, 7, 14, 15); };
-  const f8 low = quarters(halves(fold(a), fold(b)), halves(fold(c), fold(d))), high = quarters(halves(fold(e), fold(f)), halves(fold(g), fold(h)));
-  return __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
+// The sums of the lanes of twelve vectors, into p[0] ... p[11]; p[12] ... p[15] become zero.
+#if defined(GSOPT_SIXTEEN)
+inline void store_sums(float* p, const px (&v)[12]) {
+  const auto pairs = [](px a, px b) {
+    return __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29) +
+           __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+  };
+  const auto fours = [](px a, px b) {
+    return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
+           __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+  };
+  const auto eights = [](px a, px b) {
+    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+           __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+  };
+  const px low = eights(fours(pairs(v[0], v[1]), pairs(v[2], v[3])), fours(pairs(v[4], v[5]), pairs(v[6], v[7])));
+  const px high = eights(fours(pairs(v[8], v[9]), pairs(v[10], v[11])), splat<px>(0.f));
+  store_px(p, __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
+                  __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31));
 }
+#else
+inline void store_sums(float* p, const px (&v)[12]) {
+  const auto pairs = [](px a, px b) { return __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13) + __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15); };
+  const auto fours = [](px a, px b) { return __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13) + __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15); };
+  const auto eights = [](px a, px b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15); };
+  store_px(p, eights(fours(pairs(v[0], v[1]), pairs(v[2], v[3])), fours(pairs(v[4], v[5]), pairs(v[6], v[7]))));
+  store_px(p + 8, eights(fours(pairs(v[8], v[9]), pairs(v[10], v[11])), splat<px>(0.f)));
+}
+#endif
 
 }  // namespace gsopt::GSOPT_ISA

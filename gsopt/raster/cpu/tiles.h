@@ -73,19 +73,31 @@ template <class Visit> inline void for_each_tile_of_box(const Frame& frame, cons
   }
 }
 
-// Calls visit(tile) for every tile of a splat, row by row.
-template <class Visit> inline void for_each_tile(const Frame& frame, const Record& r, Visit&& visit) {
-  if (!frame.skips.tiles) {
+// Calls visit(tile) for every tile of splat `id`, row by row.
+template <class Visit> inline void for_each_tile(const Frame& frame, const Cover& cover, uint32_t id, Visit&& visit) {
+  if (cover.x0 == kAskRecord) {
+    const Record& r = frame.records.as<Record>()[id];
+    if (frame.skips.tiles) return for_each_tile_of_box(frame, r, visit);
     for (int y = r.y0; y < r.y1; ++y)
       for (int x = r.x0; x < r.x1; ++x) visit(y * frame.tiles_x + x);
     return;
   }
-  if (!TileBox{r.x0, r.x1, r.y0, r.y1}.masked()) return for_each_tile_of_box(frame, r, visit);
-  const int corner = r.y0 * frame.tiles_x + r.x0;
-  for (uint64_t rest = r.tiles; rest; rest &= rest - 1) {
+  const int corner = cover.y0 * frame.tiles_x + cover.x0;
+  for (uint64_t rest = cover.tiles; rest; rest &= rest - 1) {
     const int bit = __builtin_ctzll(rest);
     visit(corner + bit / kMaskSide * frame.tiles_x + bit % kMaskSide);
   }
+}
+
+// The cover of splat `id`, whose record is there; its slot is yet the number of its tiles.
+inline Cover cover_of(const Frame& frame, uint32_t id, const TileBox& box, uint64_t tiles) {
+  if (frame.skips.tiles && box.masked())
+    return {tiles, static_cast<uint16_t>(box.x0), static_cast<uint16_t>(box.y0), static_cast<uint32_t>(__builtin_popcountll(tiles))};
+  Cover cover = {0, kAskRecord, kAskRecord, 0};
+  uint32_t n = 0;
+  for_each_tile(frame, cover, id, [&](int) { ++n; });
+  cover.slot = n;
+  return cover;
 }
 
 }  // namespace gsopt::GSOPT_ISA
