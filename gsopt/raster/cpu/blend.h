@@ -2,7 +2,6 @@
 // it pass by, a batch at a time: first their alphas, which do not wait for each other, then what they do to the pixels.
 #pragma once
 #include "blocks.h"
-#include "parallel.h"
 
 namespace gsopt::GSOPT_ISA {
 
@@ -119,7 +118,7 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
 inline void blend_stage(Pool& pool, Frame& frame, const ForwardOutput& out) {
   const auto blend = out.work ? (out.depths ? blend_tile<true, true> : blend_tile<false, true>)
                               : (out.depths ? blend_tile<true, false> : blend_tile<false, false>);
-  parallel(pool, frame.tiles(), [&](int tile, int worker) {
+  for_each_tile_of(pool, frame, [&](int tile, int worker) {
     Work none;
     blend(frame, tile, out, out.work ? out.work[worker] : none);
   });

@@ -9,7 +9,6 @@
 // hundred instructions ahead finds several blocks to work on. Each (splat, tile) pair owns one
 // row of sums, so no two threads ever add to the same number and the result does not depend on their order.
 #pragma once
-#include "parallel.h"
 #include "tile.h"
 
 namespace gsopt::GSOPT_ISA {
@@ -133,7 +132,7 @@ inline void blend_backward_stage(Pool& pool, Frame& frame, const BackwardInput& 
   const bool depth = in.v_depths != nullptr;
   const auto tile_backward = depth ? (absgrad ? blend_tile_backward<true, true> : blend_tile_backward<true, false>)
                                    : (absgrad ? blend_tile_backward<false, true> : blend_tile_backward<false, false>);
-  parallel(pool, frame.tiles(), [&](int item, int) { tile_backward(frame, frame.tiles() - 1 - item, in); });
+  for_each_tile_of(pool, frame, [&](int k, int) { tile_backward(frame, frame.tiles() - 1 - k, in); });
 }
 
 }  // namespace gsopt::GSOPT_ISA

@@ -2,6 +2,7 @@
 // Coordinates are relative to the tile's centre, so the numbers stay small wherever the tile lies in the image.
 #pragma once
 #include "frame.h"
+#include "parallel.h"
 #include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
@@ -33,6 +34,14 @@ inline void prefetch_records(const Frame& frame, int64_t begin, int64_t end) {
   const Record* records = frame.records.as<Record>();
   end = end < frame.intersections ? end : frame.intersections;
   for (int64_t k = begin > 0 ? begin : 0; k < end; ++k) __builtin_prefetch(&records[entries[k].id], 0, 2);
+}
+
+// Calls body(k, worker) for k = 0 ... tiles - 1. A worker gets several in a row, because a tile asks for the records of the next.
+template <class Body> inline void for_each_tile_of(Pool& pool, const Frame& frame, Body&& body) {
+  const int fair = frame.tiles() / (16 * pool.threads()), run = fair < 1 ? 1 : (fair < 16 ? fair : 16);
+  parallel(pool, divide_up(frame.tiles(), run), [&](int item, int worker) {
+    for (int k = item * run; k < frame.tiles() && k < (item + 1) * run; ++k) body(k, worker);
+  });
 }
 
 inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeometry tile, Local& local) {
