@@ -32,6 +32,7 @@ test: lint
 # Rewrites docs/performance.md and what it quotes; an hour. Alone on the machine the wall times mean something.
 # What every skip saves takes hours and data of its own: python benchmarks/skips.py --root DATA --draw.
 bench: $(VENV)/.for-test
+	-GSOPT_ISA=avx2 OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json benchmarks/results/kernels.json --parts cases
 	OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json benchmarks/results/kernels.json --parts cases growth accuracy
 	$(PY) -m gsopt bench draw --json benchmarks/results/kernels.json
 	OMP_NUM_THREADS=1 $(PY) -m gsopt bench scenes --json benchmarks/results/presets.json

@@ -19,9 +19,9 @@ from gsopt.presets import PRESETS, Preset
 T = TypeVar("T")
 
 MOST = 1e9
+"""Upper bound of weights and rates: keeps infinities and typing errors out."""
 LARGEST = 1e300
 """No number of a file reaches it: whole numbers may be longer than a float holds, and sums must not overflow."""
-"""Upper bound of weights and rates: keeps infinities and typing errors out."""
 LARGEST_CONFIG = 1 << 20
 """Bytes of config.json that are read."""
 MOST_GAUSSIANS = 100_000_000

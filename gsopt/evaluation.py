@@ -15,7 +15,7 @@ from gsopt import __version__
 from gsopt.data.refined import with_refined_poses
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import LARGEST_METRICS, to_json, write_atomic
 from gsopt.film import safe_name, save_stills
 from gsopt.gaussians import Gaussians
 from gsopt.metrics import VGG_NOTE, Lpips, find_vgg_weights, psnr, ssim
@@ -28,7 +28,6 @@ TRAIN_SAMPLE = 16
 """With nothing held out, this many evenly spread input views are looked at."""
 DIGITS = 6
 """Rounds off what depends on the number of torch's threads."""
-LARGEST_METRICS = 64 << 20
 
 NO_TEST_VIEWS = (
     "This run held out no views, so nothing can be said about new ones: metrics of training views are not reported as "

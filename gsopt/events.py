@@ -20,6 +20,8 @@ from gsopt.errors import InputError, UsageError
 VERSION = 1
 LARGEST_LOG = 1 << 28
 """Bytes of events; a run of days has a tenth of it."""
+LARGEST_METRICS = 64 << 20
+"""Bytes of metrics.json that are read."""
 LAST = ("done", "stopped", "error")
 
 

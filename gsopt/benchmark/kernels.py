@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from statistics import fmean
 from typing import Any
 
 import torch
@@ -134,8 +133,7 @@ def measure(case: Case, threads: int, repetitions: int, rates: dict[str, dict[st
     intersections, entries, pairs = iteration.work()
     isa = iteration.backend.isa
     lanes = entries * LANES[isa]
-    # The mean, not the median: the clock learns of another thread's time at the scheduler's ticks only.
-    cpu = {name: fmean(stage[name].cpu for stage in stages) for name in ("blend", "blend_backward")}
+    core = {name: core_seconds(by_stage[name], iteration.backend.threads) for name in ("blend", "blend_backward")}
     drawn = repeat(iteration.render, repetitions)
     rendering = both(drawn)
     return {
@@ -152,10 +150,10 @@ def measure(case: Case, threads: int, repetitions: int, rates: dict[str, dict[st
         "entries": entries,
         "useful_pairs": pairs,
         "lane_use": pairs / lanes,
-        "pairs_per_second": {"forward": pairs / cpu["blend"], "backward": pairs / cpu["blend_backward"]},
+        "pairs_per_second": {"forward": pairs / core["blend"], "backward": pairs / core["blend_backward"]},
         "share_of_bound": {
-            "forward": bound(lanes, FORWARD_FMAS, rates[isa]) / cpu["blend"],
-            "backward": bound(lanes, BACKWARD_FMAS, rates[isa]) / cpu["blend_backward"],
+            "forward": bound(lanes, FORWARD_FMAS, rates[isa]) / core["blend"],
+            "backward": bound(lanes, BACKWARD_FMAS, rates[isa]) / core["blend_backward"],
         },
         "render": {**rendering, "frames_per_second": 1000 / rendering["wall_ms"]["median"]},
     }
@@ -168,6 +166,13 @@ LANES = {"avx512": 16, "avx2x2": 16, "avx2": 8, "portable": 8, "neon": 8}
 def bound(lanes: int, fmas: int, rates: dict[str, float]) -> float:
     """Seconds that one core needs at least for so many lanes of one exponential and `fmas` multiply-adds."""
     return lanes * (fmas / rates["fma_per_second"] + 1 / rates["exp_per_second"])
+
+
+def core_seconds(stage: dict[str, Any], threads: int) -> float:
+    """Seconds that a stage took on all its cores together. With several threads that is wall time, times the threads:
+    the clock of a process learns what another thread spent at the scheduler's ticks only, long after a stage."""
+    milliseconds = stage["cpu_ms"]["median"] if threads == 1 else threads * stage["wall_ms"]["median"]
+    return milliseconds / 1000
 
 
 def difference(after: dict[str, Reading], before: dict[str, Reading]) -> dict[str, Reading]:

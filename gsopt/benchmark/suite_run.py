@@ -129,7 +129,10 @@ def prompts(case: Case, bench: Bench) -> Path | None:
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     every = path.with_name(f"all-{path.name}")
-    command = ["prompts", "--notes", str(note["notes"]), "--domain", str(note.get("domain", "generic"))]
+    domain = str(note.get("domain", "generic"))
+    if (bench.root / domain).is_file():  # a template of one's own, named relative to notes.json
+        domain = str((bench.root / domain).absolute())
+    command = ["prompts", "--notes", str(note["notes"]), "--domain", domain]
     command += ["--category", str(note["category"])] if "category" in note else []
     command += ["--llm", bench.llm, "--model", bench.model] if case.arm == "ours-llm" else []
     call([*command, "-o", str(every), "--overwrite"], path.with_suffix(".log"))

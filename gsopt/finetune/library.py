@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,11 @@ class Library:
     """Of each pair, an index into `scenes`."""
 
 
+def _made_by(scene: Path, size: int, seed: int) -> str:
+    """What a file of pairs depends on beside the fit's number: scenes of different folders may share a name."""
+    return hashlib.sha256(f"{scene.resolve()} {size} {seed}".encode()).hexdigest()[:8]
+
+
 def collect(
     scenes: Sequence[Path], fits: int, size: int, seed: int, folder: Path, backend: Backend, say: Say
 ) -> Library:
@@ -39,7 +45,7 @@ def collect(
     fitted: list[Path] = []
     for scene in scenes:
         for fit in range(fits):
-            path = folder / f"{scene.name}_{fit}.safetensors"
+            path = folder / f"{scene.name}_{fit}_{_made_by(scene, size, seed)}.safetensors"
             if not is_regular(path):
                 try:
                     make_pairs(scene, size, fit, seed, backend).save(path)

@@ -91,14 +91,15 @@ def make_prompts(job: Job, say: Say) -> Result:
     folder = prior_folder(job.prior)
     counter = counter_for(folder)
     views = _views(job)
+    clip = _clip(job.clip) if views and job.clip else None  # before a model is asked, whose answers may cost money
     own = own_words(wish)
     if job.llm == "none":
         result = Result(_set(job, wish, template, (own, *expand(template, wish, counter))), None, counter)
     else:
         result = _with_model(job, wish, template, counter, views, say)
     made = result.made
-    if views and (job.clip or (folder is not None and (folder / "text_encoder").is_dir())):
-        made = scored(made, job, views)
+    if views and (clip is not None or (folder is not None and (folder / "text_encoder").is_dir())):
+        made = scored(made, clip or _encoder(job.prior), views)
     elif views:
         made = replace(made, made=_warned(made, (NOT_SCORED,)))
     return replace(result, made=replace(made, made=_warned(made, _too_long(made.prompts, counter))))
@@ -144,14 +145,14 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
     write_atomic(path, (json.dumps(record, indent=1, ensure_ascii=True) + "\n").encode("ascii"))
 
 
-def scored(made: PromptSet, job: Job, views: Sequence[Image.Image]) -> PromptSet:
-    """With CLIP's alignment with the views, and warnings about prompts that say something else."""
+def scored(made: PromptSet, clip: tuple[Encoder | None, int], views: Sequence[Image.Image]) -> PromptSet:
+    """With the alignment of the views, seen by an encoder at that size; prompts that say other things are warned of."""
     import torch
 
     from gsopt.llm_prompts.views import to_squares
     from gsopt.sds.conditioning import encode
 
-    encoder, size = _clip(job.clip) if job.clip else _encoder(job.prior)
+    encoder, size = clip
     if encoder is None:
         return replace(made, made=_warned(made, (NOT_SCORED,)))
     with torch.no_grad():

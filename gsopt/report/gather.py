@@ -15,7 +15,7 @@ from gsopt.cameras import Cameras
 from gsopt.config import LARGEST, TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
-from gsopt.events import read_events
+from gsopt.events import LARGEST_METRICS, read_events
 from gsopt.film import as_image
 from gsopt.render import FinishedRun, film_path, fitted, open_run, truth
 from gsopt.report import guided, posed
@@ -26,7 +26,6 @@ EXTREMES_SHOWN = 4
 INPUTS_SHOWN = 24
 TURNTABLE_FRAMES = 36
 TURNTABLE_SIDE = 400
-LARGEST_METRICS = 64 << 20
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from gsopt import cli, quats
 from gsopt.benchmark import suite, suite_bench, suite_file, suite_judge, suite_key, suite_run
 from gsopt.benchmark.suite_run import Bench, RunFailed
 from gsopt.data.scene import load_scene
+from gsopt.llm_prompts.schema import Prompt, PromptSet, write_set
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.render import draw
@@ -168,6 +170,26 @@ def test_training_that_fails_says_why(tmp_path: Path, bench: Bench) -> None:
 
 
 # What is looked at beside metrics.json
+
+
+def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the_notes(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def call(arguments: list[str], log: Path) -> None:
+        asked.append(arguments)
+        write_set(Path(arguments[arguments.index("-o") + 1]), PromptSet((Prompt("a cup", source="llm:m"),)))
+
+    monkeypatch.setattr(suite_run, "call", call)
+    note = {"notes": "a cup", "domain": "cups.md"}
+    (bench.root / "notes.json").write_text(json.dumps({"objects/a": note}))
+    (bench.root / "cups.md").write_text("")
+    case = replace(CASES[0], arm="ours-llm")
+    first, again, other = (suite_run.prompts(case, replace(bench, llm="http://x", model=m)) for m in ("m", "m", "n"))
+    assert first == again != other
+    assert [arguments[arguments.index("--model") + 1] for arguments in asked] == ["m", "n"]
+    assert asked[0][asked[0].index("--domain") + 1] == str(bench.root / "cups.md")
 
 
 def test_overlap_of_silhouettes() -> None:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 import torch
 
+from gsopt.finetune import library
 from gsopt.finetune.fits import Pairs
 from gsopt.finetune.lessons import REPAIR_SHARE, SIDE, Batch, draw, on_background
+from gsopt.raster.backend import Backend
+from gsopt.raster.reference import ReferenceBackend
 from gsopt.sds.view_prior import CHANNELS, WARPED, cosine_schedule
 
 NOISE = cosine_schedule()
@@ -80,3 +86,19 @@ def test_the_same_generator_draws_the_same_batch() -> None:
     first, second = (draw(perfect_pairs(), 4, NOISE, generator(3)) for _ in range(2))
     for a, b in zip(tensors(first), tensors(second), strict=True):
         assert torch.equal(a, b)
+
+
+def test_pairs_serve_again_only_for_the_same_scene_size_and_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[tuple[Path, int, int]] = []
+
+    def make(scene: Path, size: int, fit: int, seed: int, backend: Backend) -> Pairs:
+        made.append((scene, size, seed))
+        return perfect_pairs(1)
+
+    monkeypatch.setattr(library, "make_pairs", make)
+    calls = [("a", 80, 0), ("a", 80, 0), ("a", 64, 0), ("a", 80, 1), ("b", 80, 0)]
+    for root, size, seed in calls:
+        library.collect([tmp_path / root / "cup"], 1, size, seed, tmp_path / "pairs", ReferenceBackend(), print)
+    assert made == [(tmp_path / root / "cup", size, seed) for root, size, seed in calls[1:]]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from scripted_server import completion, serving
 from tiny_scenes import write_dataset
 
 from gsopt import cli
@@ -168,6 +169,15 @@ def test_without_a_joint_space_nothing_is_scored_and_it_is_said(
     assert {prompt.score for prompt in made.prompts} == {None}
     assert made.made is not None
     assert any("not scored" in warning for warning in made.made.warnings)
+
+
+def test_a_clip_that_cannot_be_opened_stops_before_the_model_is_asked(tmp_path: Path, photo: Path) -> None:
+    """Answers may cost money, and they would be lost."""
+    with serving([completion("{}")]) as server:
+        models = ["--llm", server.url, "--model", "m", "--clip", str(tmp_path / "none"), "--images", str(photo)]
+        assert run(tmp_path, *models) in (2, 3)
+    assert server.asked == []
+    assert not (tmp_path / "prompts.json").exists()
 
 
 def test_a_dataset_gives_its_input_views(tmp_path: Path) -> None:
