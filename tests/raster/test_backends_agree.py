@@ -179,7 +179,7 @@ def images(height: int, width: int) -> tuple[Tensor, Tensor]:
     return (target + 0.3 * torch.randn(height, width, 3, generator=rng)).clamp(0, 1), target
 
 
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 3), (16, 16), (37, 70), (9, 1607)])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 3), (16, 16), (37, 70), (9, 1607), (41, 2400)])
 @pytest.mark.parametrize("lambda_dssim", [0.0, 0.2, 1.0])
 def test_photometric(backend: Backend, height: int, width: int, lambda_dssim: float) -> None:
     rendered, target = images(height, width)
