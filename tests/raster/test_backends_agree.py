@@ -191,6 +191,16 @@ def test_photometric(backend: Backend, height: int, width: int, lambda_dssim: fl
     assert float(error) <= SSIM_GRADIENT * float(torch.linalg.vector_norm(expected.v_colors))
 
 
+def test_a_broken_pixel_spoils_the_same_rows_for_any_number_of_threads() -> None:
+    """Rows are filtered in pairs, and every band of rows must pair them alike: 0 times NaN is NaN."""
+    rendered, target = images(60, 20)
+    rendered[30] = torch.nan
+    one, *others = (CpuBackend(threads).photometric(rendered, target, 0.2).v_colors for threads in (1, 2, 3))
+    assert 0 < int(one.isnan().sum()) < one.numel()
+    for other in others:
+        torch.testing.assert_close(other, one, rtol=0, atol=0, equal_nan=True)
+
+
 def test_equal_images_have_no_loss(backend: Backend) -> None:
     _, target = images(20, 18)
     got = backend.photometric(target, target.clone(), 0.2)

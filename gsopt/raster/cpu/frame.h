@@ -73,7 +73,7 @@ struct ParameterGradients {
 // What a frame does not compute because no pixel would change; each can be switched off, to see what it is worth.
 struct Skips {
   bool tiles = true;        // a splat is listed only in the tiles, and drawn only in the blocks, that its ellipse reaches
-  bool termination = true;  // a block takes no more splats once all its pixels are opaque
+  bool termination = true;  // a block takes no more splats soon after all its pixels are opaque
 };
 
 struct Frame {
@@ -91,7 +91,7 @@ struct Frame {
   Buffer found;              // Found[chunks]: scratch of projection
   Buffer tile_begin;         // uint32[tiles + 1]: first entry of a tile
   Buffer entries;            // Entry[intersections]
-  Buffer masks;              // uint32[intersections]: bit b: the splat changed block b of the tile
+  Buffer masks;              // uint32[intersections]: bit b: the splat reaches block b of the tile, not yet opaque
   Buffer transmittance;      // float[tiles][blocks][pixels]
   Buffer last;               // int32[tiles][blocks][pixels]: number in the tile, from 1, of the last splat that counts; 0: none
   Buffer rows;               // float[intersections][kRow]

@@ -33,10 +33,10 @@ inline constexpr PairWindow kPairWindow;
 // A rectangle of the image: rows [y0, y1), floats [x0, x0 + n) of rows of `width` floats.
 struct Band {
   int y0, y1, x0, n, width, height;
-  // With what its filtered rows need around it.
+  // With what its filtered rows need around it; it begins at an even row, as every pair of rows does.
   Band grown() const {
     const int left = x0 < kHalo ? 0 : x0 - kHalo, right = x0 + n + kHalo > width ? width : x0 + n + kHalo;
-    return {y0 < kRadius ? 0 : y0 - kRadius, y1 + kRadius > height ? height : y1 + kRadius, left, right - left, width, height};
+    return {y0 < kRadius + 1 ? 0 : y0 - kRadius - 1, y1 + kRadius > height ? height : y1 + kRadius, left, right - left, width, height};
   }
 };
 
@@ -198,15 +198,14 @@ inline void photometric_stage(Pool& pool, PhotometricArguments& a) {
   const int width = 3 * a.width, strip = divide_up(divide_up(width, divide_up(width, kStrip)), kWide) * kWide, strips = divide_up(width, strip);
   const int bands = pool.threads() == 1 ? 1 : 2 * pool.threads();
   const int rows = (a.height + 2 * bands - 1) / (2 * bands) * 2;  // even, so that no pair of rows is split
-  const int items = bands * strips;
   constexpr int64_t kRingFloats = 3 * kRing * kRingStride;
-  a.scratch->reserve(sizeof(float) * kRingFloats * items + sizeof(double) * 2 * strips * a.height);
-  double *ssim = reinterpret_cast<double*>(a.scratch->as<float>() + kRingFloats * items), *l1 = ssim + static_cast<int64_t>(strips) * a.height;
-  parallel(pool, items, [&](int item, int) {
+  a.scratch->reserve(sizeof(float) * kRingFloats * pool.threads() + sizeof(double) * 2 * strips * a.height);
+  double *ssim = reinterpret_cast<double*>(a.scratch->as<float>() + kRingFloats * pool.threads()), *l1 = ssim + static_cast<int64_t>(strips) * a.height;
+  parallel(pool, bands * strips, [&](int item, int worker) {
     const int x0 = item % strips * strip, y0 = item / strips * rows;
     const Band band = {y0, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < strip ? width - x0 : strip, width, a.height};
     const int64_t sums = static_cast<int64_t>(item % strips) * a.height;
-    if (y0 < a.height) photometric_band(a, band, a.scratch->as<float>() + kRingFloats * item, ssim + sums, l1 + sums);
+    if (y0 < a.height) photometric_band(a, band, a.scratch->as<float>() + kRingFloats * worker, ssim + sums, l1 + sums);
   });
   a.ssim = a.l1 = 0;
   for (int64_t k = 0; k < static_cast<int64_t>(strips) * a.height; ++k) a.ssim += ssim[k], a.l1 += l1[k];

@@ -77,7 +77,7 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
     store8(rad[0], rx), store8(rad[1], ry);
   }
   TileBox boxes[kLanes] = {};
-  uint64_t tiles[kLanes];
+  uint64_t tiles[kLanes] = {};
   for (int l = 0; l < lanes; ++l)
     if (mask >> l & 1) boxes[l] = tile_box(frame, out[0][l], out[1][l], rad[0][l], rad[1][l]);
   if (mask && frame.skips.tiles) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);

@@ -1,5 +1,6 @@
 // Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the language has no
-// operator. 8 lanes hold Gaussians; 8, or with GSOPT_SIXTEEN 16, hold the pixels of a block.
+// operator. 8 lanes hold Gaussians; 8, or with GSOPT_SIXTEEN 16, hold the pixels of a block
+// (`px`) and whatever else is as wide as it can be (`wide`).
 // Included once per instruction set; everything lives in that set's own namespace.
 #pragma once
 #include <bit>
@@ -158,7 +159,7 @@ inline pxi load_pxi(const int32_t* p) { return load8i(p); }
 inline void store_pxi(int32_t* p, pxi v) { store8i(p, v); }
 inline pxi splat_pxi(int32_t x) { return splat8i(x); }
 #endif
-using wide = px;  // where neither Gaussians nor pixels set the number of lanes
+using wide = px;
 using widei = pxi;
 inline widei splat_widei(int32_t x) { return splat_pxi(x); }
 inline void store_widei(int32_t* p, widei v) { store_pxi(p, v); }
@@ -168,7 +169,7 @@ constexpr int kWide = sizeof(wide) / sizeof(float);
 constexpr int kPixels = sizeof(px) / sizeof(float);  // pixels of a block, always 4 wide
 constexpr int kBlocks = 256 / kPixels;               // blocks of a 16x16 tile
 
-// 2^x for |x| < 126, relative error 1.5e-7: minimax polynomial of degree 5 on [-1/2, 1/2] (Remez, relative weight)
+// 2^x for |x| < 126, relative error 2.4e-7: minimax polynomial of degree 5 on [-1/2, 1/2] (Remez, relative weight)
 // times a power of two put together from its bits. Outside that range the result is arbitrary but harmless: mask it.
 template <class V> inline V exp2(V x) {
   const V magic = splat<V>(12582912.f);  // 1.5 * 2^23: adding it leaves round(x) in the low bits of the mantissa

@@ -51,35 +51,35 @@ inline void tile_masks(f8 mx, f8 my, f8 A, f8 B, f8 C, f8 lo, const TileBox box[
   }
 }
 
-// Calls visit(tile), row by row, for every tile of a splat whose box is too large for a mask.
-template <class Visit> inline void for_each_tile_of_box(const Frame& frame, const Record& r, Visit&& visit) {
+struct Span {
+  int x0, x1;  // half open
+};
+// The tiles of row y that a splat touches. Not inlined: those who count tiles and those who list them must agree to the bit.
+[[gnu::noinline]] inline Span tiles_of_row(const Record& r, int y) {
   const float t = (r.log2_opacity - kLog2AlphaMin) * 1.0001f + 1e-3f;
   const float iA = 1.f / r.A, slope = r.B * iA;
   const float extreme = -(r.B / r.C) * __builtin_sqrtf(t / (r.B * r.B + r.C * r.C));
   const auto limit = [](float v, float lo, float hi) { return v < lo ? lo : (v > hi ? hi : v); };
-  for (int y = r.y0; y < r.y1; ++y) {
-    const float top = static_cast<float>(y * kTile) + 0.5f - r.my, bottom = top + (kTile - 1);
-    const float yr = limit(extreme, top, bottom), yl = limit(-extreme, top, bottom);
-    const float sr = t - r.C * yr * (r.C * yr), sl = t - r.C * yl * (r.C * yl);
-    if (sr < 0.f && sl < 0.f) continue;
-    const float margin = 0.02f + 2e-6f * (__builtin_fabsf(slope * yr) + __builtin_fabsf(r.mx));
-    const float right = r.mx - slope * yr + __builtin_sqrtf(sr > 0.f ? sr : 0.f) * iA + margin;
-    const float left = r.mx - slope * yl - __builtin_sqrtf(sl > 0.f ? sl : 0.f) * iA - margin;
-    int x0 = static_cast<int>(__builtin_ceilf(limit((left - (kTile - 0.5f)) * (1.f / kTile), -1.f, 65536.f)));
-    int x1 = static_cast<int>(__builtin_floorf(limit((right - 0.5f) * (1.f / kTile), -1.f, 65536.f))) + 1;
-    x0 = x0 > r.x0 ? x0 : r.x0;
-    x1 = x1 < r.x1 ? x1 : r.x1;
-    for (int x = x0; x < x1; ++x) visit(y * frame.tiles_x + x);
-  }
+  const float top = static_cast<float>(y * kTile) + 0.5f - r.my, bottom = top + (kTile - 1);
+  const float yr = limit(extreme, top, bottom), yl = limit(-extreme, top, bottom);
+  const float sr = t - r.C * yr * (r.C * yr), sl = t - r.C * yl * (r.C * yl);
+  if (sr < 0.f && sl < 0.f) return {0, 0};
+  const float margin = 0.02f + 2e-6f * (__builtin_fabsf(slope * yr) + __builtin_fabsf(r.mx));
+  const float right = r.mx - slope * yr + __builtin_sqrtf(sr > 0.f ? sr : 0.f) * iA + margin;
+  const float left = r.mx - slope * yl - __builtin_sqrtf(sl > 0.f ? sl : 0.f) * iA - margin;
+  const int x0 = static_cast<int>(__builtin_ceilf(limit((left - (kTile - 0.5f)) * (1.f / kTile), -1.f, 65536.f)));
+  const int x1 = static_cast<int>(__builtin_floorf(limit((right - 0.5f) * (1.f / kTile), -1.f, 65536.f))) + 1;
+  return {x0 > r.x0 ? x0 : r.x0, x1 < r.x1 ? x1 : r.x1};
 }
 
 // Calls visit(tile) for every tile of splat `id`, row by row.
 template <class Visit> inline void for_each_tile(const Frame& frame, const Cover& cover, uint32_t id, Visit&& visit) {
   if (cover.x0 == kAskRecord) {
     const Record& r = frame.records.as<Record>()[id];
-    if (frame.skips.tiles) return for_each_tile_of_box(frame, r, visit);
-    for (int y = r.y0; y < r.y1; ++y)
-      for (int x = r.x0; x < r.x1; ++x) visit(y * frame.tiles_x + x);
+    for (int y = r.y0; y < r.y1; ++y) {
+      const Span span = frame.skips.tiles ? tiles_of_row(r, y) : Span{r.x0, r.x1};
+      for (int x = span.x0; x < span.x1; ++x) visit(y * frame.tiles_x + x);
+    }
     return;
   }
   const int corner = cover.y0 * frame.tiles_x + cover.x0;
