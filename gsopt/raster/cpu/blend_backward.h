@@ -132,6 +132,7 @@ inline void blend_backward_stage(Pool& pool, Frame& frame, const BackwardInput& 
   const bool depth = in.v_depths != nullptr;
   const auto tile_backward = depth ? (absgrad ? blend_tile_backward<true, true> : blend_tile_backward<true, false>)
                                    : (absgrad ? blend_tile_backward<false, true> : blend_tile_backward<false, false>);
+  // From the last tile to the first, as each goes through its splats: the records asked for are those before.
   for_each_tile_of(pool, frame, [&](int k, int) { tile_backward(frame, frame.tiles() - 1 - k, in); });
 }
 

@@ -45,10 +45,9 @@ inline f8 abs(f8 a) { return (f8)((i8)a & splat8i(0x7fffffff)); }
 #if defined(__AVX2__)
 inline int movemask(i8 m) { return _mm256_movemask_ps((__m256)m); }
 inline i8 max(i8 a, i8 b) { return (i8)_mm256_max_epi32((__m256i)a, (__m256i)b); }
-// a where m, else +0; and both of two masks. By name, because the operator & is an integer instruction, for whose result
+// a where m, else +0. By name, because the operator & is an integer instruction, for whose result
 // an instruction on floats waits two cycles more.
 inline f8 keep(i8 m, f8 a) { return (f8)_mm256_and_ps((__m256)m, (__m256)a); }
-inline i8 both(i8 m, i8 n) { return (i8)_mm256_and_ps((__m256)m, (__m256)n); }
 inline f8 select(i8 m, f8 a, f8 b) { return (f8)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)m); }
 inline f8 sqrt(f8 a) { return (f8)_mm256_sqrt_ps((__m256)a); }
 inline f8 sqrt_near(f8 a) { return (f8)_mm256_rsqrt_ps((__m256)a) * a; }  // off by 4e-4 at most; NaN at 0
@@ -63,7 +62,6 @@ inline int movemask(i8 m) {
 }
 inline i8 max(i8 a, i8 b) { return a > b ? a : b; }
 inline f8 keep(i8 m, f8 a) { return (f8)(m & (i8)a); }
-inline i8 both(i8 m, i8 n) { return m & n; }
 inline f8 select(i8 m, f8 a, f8 b) { return m ? a : b; }
 inline f8 sqrt(f8 a) {
   f8 r;
@@ -78,12 +76,6 @@ inline i8 shift_left(i8 a, i8 n) { return a << n; }
 
 inline bool any(i8 m) { return movemask(m) != 0; }
 inline f8 clamp(f8 x, f8 lo, f8 hi) { return min(max(x, lo), hi); }
-
-inline float sum(f8 a) {
-  a += __builtin_shufflevector(a, a, 4, 5, 6, 7, 0, 1, 2, 3);
-  a += __builtin_shufflevector(a, a, 2, 3, 0, 1, 6, 7, 4, 5);
-  return a[0] + a[1];
-}
 
 // The largest lane.
 inline int most(i8 a) {
@@ -106,7 +98,6 @@ inline i16 splat16i(int32_t x) { return i16{x, x, x, x, x, x, x, x, x, x, x, x, 
 inline i16 bits(f16 v) { return (i16)v; }
 inline f16 from_bits(i16 v) { return (f16)v; }
 inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
-inline i16 both(i16 m, i16 n) { return m & n; }
 inline f16 select(i16 m, f16 a, f16 b) { return m ? a : b; }
 inline i16 select(i16 m, i16 a, i16 b) { return m ? a : b; }
 inline i16 to_int(f16 v) { return __builtin_convertvector(v, i16); }  // truncates
@@ -115,8 +106,6 @@ inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
 inline i16 shift_exponent(i16 n) { return n << 23; }
 inline f8 low_half(f16 a) { return __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7); }
 inline f8 high_half(f16 a) { return __builtin_shufflevector(a, a, 8, 9, 10, 11, 12, 13, 14, 15); }
-inline f8 fold(f16 a) { return low_half(a) + high_half(a); }
-inline float sum(f16 a) { return sum(fold(a)); }
 #if defined(__AVX512F__)
 inline f16 sqrt(f16 a) { return (f16)_mm512_sqrt_ps((__m512)a); }
 inline f16 sqrt_near(f16 a) { return (f16)_mm512_rsqrt14_ps((__m512)a) * a; }
@@ -264,8 +253,6 @@ inline void load_columns(const float* rows, f8 v[8]) {
   transpose8(v);
 }
 #endif
-
-inline f8 fold(f8 a) { return a; }
 
 // The sums of the lanes of twelve vectors, into p[0] ... p[11]; p[12] ... p[15] become zero.
 #if defined(GSOPT_SIXTEEN)
