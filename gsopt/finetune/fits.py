@@ -6,7 +6,7 @@ Gaussians are rendered with all that guidance would show a prior (`condition_pla
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,10 +84,9 @@ def make_pairs(folder: Path, size: int, fit: int, seed: int, backend: Backend) -
     random = generator(seed, fit, 0, folder.name)
     inputs, others = _dealt(scene, random)
     length = LENGTHS[_below(len(LENGTHS), random)]
-    looks = [
-        _look(gaussians, inputs, [*others, inputs[0]], size, backend)
-        for gaussians in fitted(replace(scene, train=tuple(inputs)), length, seed + fit, backend)
-    ]
+    config = short_config(length, seed + fit)
+    scene = with_mirrors(config, replace(scene, train=tuple(inputs)))
+    looks = [look(g, scene, [*others, inputs[0]], size, backend) for g in fitted(config, scene, backend)]
     return Pairs.cat(looks)
 
 
@@ -115,9 +114,9 @@ def _dealt(scene: Scene, random: torch.Generator) -> tuple[list[View], list[View
     return views[:count], views[count : count + LOOKS]
 
 
-def fitted(scene: Scene, length: int, seed: int, backend: Backend) -> Iterator[Gaussians]:
-    """The Gaussians of a short run after a third of it and at its end."""
-    config = TrainConfig(
+def short_config(length: int, seed: int) -> TrainConfig:
+    """A run of `length` steps, as a user's but for its size."""
+    return TrainConfig(
         iterations=length,
         init=InitConfig(count=5000),
         density=DensityConfig(refine_start=length // 10, max_gaussians=20_000),
@@ -125,23 +124,27 @@ def fitted(scene: Scene, length: int, seed: int, backend: Backend) -> Iterator[G
         preview_every=0,
         seed=seed,
     )
-    scene = with_mirrors(config, scene)
+
+
+def fitted(config: TrainConfig, scene: Scene, backend: Backend) -> Iterator[Gaussians]:
+    """The Gaussians of a run after a third of it and at its end."""
     degree = schedule.max_sh_degree(config, len(scene.train))
-    gaussians, _ = first_gaussians(scene, config.init, degree, seed)
+    gaussians, _ = first_gaussians(scene, config.init, degree, config.seed)
     trainer = Trainer(config, scene, gaussians, backend)
-    for end in (length // 3, length):
+    for end in (config.iterations // 3, config.iterations):
         while trainer.step < end:
             trainer.advance()
         yield trainer.model.gaussians
 
 
 @torch.no_grad()
-def _look(gaussians: Gaussians, inputs: list[View], views: list[View], size: int, backend: Backend) -> Pairs:
-    references = square_views(inputs, size, BLACK)
+def look(gaussians: Gaussians, scene: Scene, views: Sequence[View], size: int, backend: Backend) -> Pairs:
+    """What a guided run on `scene` would show the prior from the cameras of `views`, and the views."""
+    references = square_views(scene.train, size, BLACK)
     cameras = references.cameras
     depths = torch.stack([depth_in(gaussians, cameras[k], backend) for k in range(len(cameras))])
     references = replace(references, depths=depths)
-    u = coverage.uncertainty(coverage.coverage(gaussians, [view.camera for view in inputs], backend))
+    u = coverage.uncertainty(coverage.coverage(gaussians, [view.camera for view in scene.drawn], backend))
     truths = square_views(views, size, BLACK)
     rows = [_seen(gaussians, u, view, references, size, backend) for view in views]
     renders, uncertainties, warped = (torch.stack(column) for column in zip(*rows, strict=True))

@@ -164,9 +164,11 @@ class Guide:
     def _guided(self, step: int, index: int, gaussians: Gaussians, settings: RasterSettings) -> Gradients:
         """Render, ask, and carry the answer back to the parameters."""
         assert self.memory.coverage is not None
-        moved = None if self.config.policy == "recon" else self._random(step, index, "jitter")
-        camera = self.rig.camera(index, moved)
-        frame = self.backend.forward(gaussians, camera, settings, self._background(step), depth=self.prior.aligned)
+        # recon compares with a target of an earlier step: neither camera nor background may have changed since.
+        still = self.config.policy == "recon"
+        camera = self.rig.camera(index, None if still else self._random(step, index, "jitter"))
+        background = self._background(index if still else step)
+        frame = self.backend.forward(gaussians, camera, settings, background, depth=self.prior.aligned)
         u = coverage.uncertainty(self.memory.coverage)
         seen = Seen(
             camera=camera,
@@ -262,10 +264,10 @@ class Guide:
             p.view not in ("all", "top") for p in self.conditioning.prompts
         )
 
-    def _background(self, step: int) -> Float[Tensor, "3"]:
+    def _background(self, number: int) -> Float[Tensor, "3"]:
         if self.background is not None:
             return self.background
-        return torch.rand(3, generator=self._random(step, 0, "background"))
+        return torch.rand(3, generator=self._random(number, 0, "background"))
 
     def _random(self, step: int, view: int, purpose: str) -> torch.Generator:
         return generator(self.seed, step, view, purpose)

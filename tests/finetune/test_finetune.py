@@ -13,14 +13,16 @@ import pytest
 import torch
 
 from gsopt.cli import main
+from gsopt.config import InitConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.finetune import fits, measure
 from gsopt.finetune.course import Course
-from gsopt.finetune.fits import Pairs, make_pairs, whole_scene
+from gsopt.finetune.fits import Pairs, look, make_pairs, whole_scene
 from gsopt.finetune.learn import STATE, Training, loss
 from gsopt.finetune.lessons import draw
 from gsopt.finetune.run import Lessons
 from gsopt.guidance_config import GuidanceConfig
+from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.sds.opening import open_prior
 from gsopt.sds.prior import Condition
@@ -77,6 +79,19 @@ def test_pairs_are_made_of_views_that_were_held_out(pairs: Pairs) -> None:
     assert bool((pairs.truth[:, :3] <= pairs.truth[:, 3:] + 1).all())
     assert int(pairs.warped[:, :, 4].max()) > 100
     assert int(pairs.uncertainty.max()) > 0
+
+
+def test_mirror_images_count_as_input_views(scenes: Path) -> None:
+    """As in a run: what they show is less uncertain."""
+    scene = whole_scene(scenes / "one", SIZE)
+    few = replace(scene, train=scene.train[:2])
+    gaussians, _ = first_gaussians(scene, InitConfig(count=300), 0, 0)
+    backend = make_backend("cpu", 1)
+    alone, with_images = (
+        look(gaussians, replace(few, mirrored=images), scene.train[4:], SIZE, backend).uncertainty.float()
+        for images in ((), scene.train[2:4])
+    )
+    assert with_images.mean() < 0.9 * alone.mean()
 
 
 def test_pairs_survive_their_file(pairs: Pairs, tmp_path: Path) -> None:

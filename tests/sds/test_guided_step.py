@@ -132,6 +132,20 @@ def test_lambda_scales_the_gradient_and_nothing_else(policy) -> None:
         torch.testing.assert_close(2 * getattr(one, name), getattr(two, name), rtol=1e-5, atol=1e-12)
 
 
+def test_a_kept_target_stands_on_the_background_of_the_render_it_is_compared_with() -> None:
+    """With random backgrounds too: of an unchanged scene, a candidate's render is the same in every step."""
+    guided = guide(toy(), replace(ALWAYS, policy="recon", refresh_every=1000), background=None)
+    renders: dict[int, torch.Tensor] = {}
+    met = 0
+    for step in range(1, 200):
+        guided.gradients(step, blobs(), SETTINGS)
+        assert guided.sample is not None
+        met += guided.sample.view in renders
+        assert torch.equal(renders.setdefault(guided.sample.view, guided.sample.render), guided.sample.render)
+    assert met > 10
+    assert len({float(render[0, 0, 0]) for render in renders.values()}) > 10
+
+
 def test_no_weight_calls_no_prior() -> None:
     prior = toy()
     assert guide(prior, weight=0.0).gradients(3, blobs(), SETTINGS) is None
