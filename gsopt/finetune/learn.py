@@ -112,10 +112,11 @@ class Training:
 
 
 def loss(unet: Any, batch: Batch) -> Tensor:
-    """Mean squared error of x0_hat, and of its differences along both axes."""
+    """Weighted mean over the lessons of the squared error of x0_hat and the absolute error of its differences."""
     error = predict(unet, batch.x_t, batch.t, batch.planes, batch.said) - batch.x0
-    edges = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
-    return error.square().mean() + EDGE_WEIGHT * edges
+    inside = (1, 2, 3)
+    edges = error.diff(dim=-1).abs().mean(inside) + error.diff(dim=-2).abs().mean(inside)
+    return (batch.weight * (error.square().mean(inside) + EDGE_WEIGHT * edges)).mean()
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

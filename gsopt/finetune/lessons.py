@@ -28,6 +28,8 @@ CROP_SHARE = 0.6
 """Lessons that cut SIDE px out of the render; the others see all of it, reduced."""
 WHITE_SHARE, BLACK_SHARE = 0.5, 0.2
 """Backgrounds; the others have a random color."""
+USUAL_ERROR, LEAST_ERROR = 0.02, 0.004
+"""Mean square, colors in [-1, 1]: of a render, and what is added to each so that perfect ones do not rule."""
 WITHOUT_RENDER, WITHOUT_REFERENCES, WITHOUT_REFERENCE, WITHOUT_UNCERTAINTY = 0.05, 0.15, 0.1, 0.05
 
 
@@ -41,6 +43,8 @@ class Batch:
     planes: Float[Tensor, "B C S S"]
     """See `condition_planes`."""
     said: Said
+    weight: Float[Tensor, "B"]
+    """Falls with the error of the render: what counts is by which share it is lowered, as decibels count."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,9 @@ def draw(pairs: Pairs, count: int, noise: NoiseSchedule, random: torch.Generator
     )
     clean = torch.where(repair[:, None, None, None], 2 * images.render[:, :3] - 1, x0)
     x_t = add_noise(clean, torch.randn(x0.shape, generator=random), noise.signal(t, x0))
-    return Batch(x0, x_t, t, _forgotten(images.planes, repair, random), said)
+    error = (2 * images.render[:, :3] - 1 - x0).square().mean((1, 2, 3))
+    weight = USUAL_ERROR / (error + LEAST_ERROR)
+    return Batch(x0, x_t, t, _forgotten(images.planes, repair, random), said, weight)
 
 
 def backgrounds(count: int, random: torch.Generator) -> Float[Tensor, "B 3"]:

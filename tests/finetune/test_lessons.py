@@ -9,7 +9,7 @@ import torch
 
 from gsopt.finetune import library
 from gsopt.finetune.fits import Pairs
-from gsopt.finetune.lessons import REPAIR_SHARE, SIDE, Batch, draw, on_background
+from gsopt.finetune.lessons import REPAIR_SHARE, SIDE, USUAL_ERROR, Batch, draw, on_background
 from gsopt.raster.backend import Backend
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.sds.view_prior import CHANNELS, WARPED, cosine_schedule
@@ -69,6 +69,25 @@ def test_repair_lessons_never_see_the_truth() -> None:
         assert bool((repair | ((mean - truth).abs() < 0.1)).all())
         seen += int(repair.sum())
     assert 0.6 < seen / (8 * 32 * REPAIR_SHARE) < 1.3
+
+
+def test_lessons_count_by_the_share_of_the_error_that_is_taken_away() -> None:
+    """Half the error counts as much where the render is bad as where it is good, and next to nothing where there is
+    none."""
+    pairs = perfect_pairs()
+    pairs.truth[:, 3] = 255
+    pairs.render[:, 3] = 255
+    shares = []
+    for wrong in (0, 40, 120):
+        pairs.truth[:, :3].fill_(200)
+        pairs.render[:, :3].fill_(200 - wrong)
+        batch = draw(pairs, 32, NOISE, generator(0))
+        known = batch.planes[:, 3].flatten(1).any(1)
+        error = (batch.planes[:, :3] - batch.x0).square().mean((1, 2, 3))
+        shares.append(float((batch.weight * error)[known].mean()))
+    assert shares[0] == 0
+    assert shares[2] == pytest.approx(USUAL_ERROR, rel=0.05)
+    assert shares[1] == pytest.approx(shares[2], rel=0.2)
 
 
 def test_backgrounds_are_the_same_in_all_images_of_a_row() -> None:
