@@ -49,17 +49,20 @@ RESULT = Path(__file__).parent / "results" / "prior_strength.json"
 SIZE = 128
 """Of the renders that the prior is asked about, px: what the embedded one was made for."""
 WHITE = torch.ones(3)
-UNGUARDED = ["--guidance.guard-views", "0"]
 EXACT = math.inf
+UNGUARDED = ["--guidance.guard-views", "0"]
+EVERYWHERE = [*UNGUARDED, "--guidance.min-uncertainty", "0", "--guidance.certain-weight", "1"]
+"""Every view and every pixel of the subject alike, whatever the input views decide."""
+UNCERTAIN = [*UNGUARDED, "--guidance.min-uncertainty", "0.05", "--guidance.certain-weight", "0"]
+"""Weighted by what no input view shows."""
 ARMS: dict[str, tuple[float | None, list[str]]] = {
     "off": (None, ["--lambda-sds", "0"]),
-    **{f"{repair:g} dB": (repair, UNGUARDED) for repair in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)},
-    "exact": (EXACT, UNGUARDED),
-    "exact, guarded": (EXACT, []),
-    "exact, every view guided": (EXACT, [*UNGUARDED, "--guidance.min-uncertainty", "0"]),
-    "exact, lambda 0.05": (EXACT, [*UNGUARDED, "--lambda-sds", "0.05"]),
-    "exact, lambda 1": (EXACT, [*UNGUARDED, "--lambda-sds", "1"]),
-    "exact, colors only": (EXACT, [*UNGUARDED, "--guidance.geometry", "0"]),
+    "exact, only what is uncertain, lambda 0.05": (EXACT, [*UNCERTAIN, "--lambda-sds", "0.05"]),
+    "exact, only what is uncertain": (EXACT, UNCERTAIN),
+    "exact, what is certain a third": (EXACT, [*EVERYWHERE, "--guidance.certain-weight", "0.35"]),
+    "exact, lambda 1": (EXACT, [*EVERYWHERE, "--lambda-sds", "1"]),
+    "exact": (EXACT, EVERYWHERE),
+    **{f"{repair:g} dB": (repair, EVERYWHERE) for repair in (4.0, 2.0, 1.0, 0.5)},
 }
 """By how much the prior repairs, dB (None: no prior), and flags."""
 METRICS = ("psnr", "ssim", "lpips_alex")

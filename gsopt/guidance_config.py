@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 from gsopt import check
 from gsopt.errors import UsageError
 
+T = TypeVar("T")
 MOST = 1e9
 """Upper bound of weights: keeps infinities and typing errors out."""
 
@@ -61,8 +62,12 @@ class GuidanceConfig:
     """Share of the run after which no step is guided."""
     every: int | None = None
     """Steps between two guided ones. When not given: 2 with recon, whose targets last; else 10."""
-    min_uncertainty: float = 0.05
-    """Mean uncertainty of a view below which it is not guided: the input views decide there."""
+    min_uncertainty: float | None = None
+    """Mean uncertainty of a view below which it is not guided: the input views decide there. When not given: 0.05; 0
+    for a view-conditioned prior, whose guard has measured that it knows more."""
+    certain_weight: float | None = None
+    """Weight of a pixel that the input views decide, next to 1 for one that none of them shows. When not given: 1 for a
+    view-conditioned prior, which knows these views; 0 for a text-to-image prior, which knows better nowhere."""
     geometry: float = 1.0
     """Factor on the guidance gradient of positions, rotations, scales and opacities; 0 guides colors only."""
     clip_rms: float = 1.0
@@ -77,7 +82,7 @@ class GuidanceConfig:
     references: int = 4
     """Input views that a view-conditioned prior sees, those nearest to the guided camera."""
     guard_views: int = 2
-    """Input views left out in turn by the short runs that lower the weight where guidance hurts; 0 = no such check."""
+    """Input views left out in turn by the short runs that say whether guidance would help; 0 = no such check."""
     guard_steps: int = 240
     """Length of these runs."""
     size: int = 0
@@ -113,7 +118,10 @@ class GuidanceConfig:
         check.within("--guidance.stop", self.stop, self.start, 1.0, "It must not lie before the start.")
         if self.every is not None:
             check.at_least("--guidance.every", self.every, 1, "1 guides every step.")
-        check.within("--guidance.min-uncertainty", self.min_uncertainty, 0.0, 1.0, "0 guides every view.")
+        if self.min_uncertainty is not None:
+            check.within("--guidance.min-uncertainty", self.min_uncertainty, 0.0, 1.0, "0 guides every view.")
+        if self.certain_weight is not None:
+            check.within("--guidance.certain-weight", self.certain_weight, 0.0, 1.0, "0 guides what is uncertain.")
         check.within("--guidance.geometry", self.geometry, 0.0, MOST, "0 guides colors only.")
         check.within("--guidance.clip-rms", self.clip_rms, 0.0, MOST, "0 lets any gradient pass.")
         if self.denoise_steps is not None:
@@ -127,10 +135,16 @@ class GuidanceConfig:
             check.within("--guidance.size", self.size, 8, 4096, "0 takes what the prior was made for.")
 
 
+def sure(value: T | None) -> T:
+    """A value of a settled configuration: nothing in it is left open."""
+    assert value is not None
+    return value
+
+
 def settled(config: GuidanceConfig, view_conditioned: bool) -> GuidanceConfig:
     """The same with what was left to gsopt decided, for a prior of that kind."""
     policy = config.policy if config.policy != "auto" else "recon" if view_conditioned else "sds"
-    scale, steps = (1.0, 1) if view_conditioned else (3.0, 5)
+    scale, steps, certain, least = (1.0, 1, 1.0, 0.0) if view_conditioned else (3.0, 5, 0.0, 0.05)
     every = 2 if policy == "recon" else 10
     return replace(
         config,
@@ -138,4 +152,6 @@ def settled(config: GuidanceConfig, view_conditioned: bool) -> GuidanceConfig:
         guidance_scale=scale if config.guidance_scale is None else config.guidance_scale,
         every=every if config.every is None else config.every,
         denoise_steps=steps if config.denoise_steps is None else config.denoise_steps,
+        min_uncertainty=least if config.min_uncertainty is None else config.min_uncertainty,
+        certain_weight=certain if config.certain_weight is None else config.certain_weight,
     )

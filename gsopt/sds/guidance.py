@@ -11,12 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.cameras import Cameras
-from gsopt.data.scene import Scene
+from gsopt.data.scene import Scene, View
 from gsopt.errors import NumericalError
 from gsopt.gaussians import Gaussians
-from gsopt.guidance_config import GuidanceConfig, settled
+from gsopt.guidance_config import GuidanceConfig, settled, sure
+from gsopt.metrics import psnr
 from gsopt.raster.api import expected_depth
-from gsopt.raster.backend import Backend, Gradients, RasterSettings
+from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
 from gsopt.sds import coverage, policies, schedule
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.noise import Latents, generator
@@ -27,6 +28,10 @@ COVERAGE_EVERY = 100
 """Steps after which coverage is taken anew even if no Gaussian came or went."""
 MOST_FAILURES = 3
 """Failed calls in a row after which the run goes on without guidance."""
+SMALLEST = 0.05
+"""Share of the picture below which a subject counts as filling this much."""
+MOST_PSNR = 60.0
+"""dB; from there on images are the same."""
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
 
 Warn = Callable[[str], None]
@@ -68,8 +73,7 @@ class Seen:
     images: Images
     """One, 0..1."""
     alphas: Float[Tensor, "S S"]
-    weights: Float[Tensor, "S S"]
-    """Its uncertainty."""
+    uncertainty: Float[Tensor, "S S"]
     depth: Float[Tensor, "S S"] | None = None
     references: References | None = None
 
@@ -111,9 +115,6 @@ class Guide:
         color per step, as the training does."""
         self.prior, self.conditioning, self.backend = prior, conditioning, backend
         self.config = settled(config, prior.aligned)
-        assert self.config.denoise_steps is not None
-        assert self.config.guidance_scale is not None
-        self._denoise_steps, self._guidance_scale = self.config.denoise_steps, self.config.guidance_scale
         self.weight, self.iterations, self.seed, self.background = weight, iterations, seed, background
         self.warn = warn
         self.inputs = [view.camera for view in scene.drawn]
@@ -130,7 +131,7 @@ class Guide:
             return None
         self._look_around(step, gaussians)
         assert self.memory.mean_u is not None
-        index = draw_candidate(self.memory.mean_u, self.config.min_uncertainty, self._random(step, 0, "camera"))
+        index = draw_candidate(self.memory.mean_u, sure(self.config.min_uncertainty), self._random(step, 0, "camera"))
         if index is None:
             self.counts.decided += 1
             return None
@@ -168,16 +169,7 @@ class Guide:
         still = self.config.policy == "recon"
         camera = self.rig.camera(index, None if still else self._random(step, index, "jitter"))
         background = self._background(index if still else step)
-        frame = self.backend.forward(gaussians, camera, settings, background, depth=self.prior.aligned)
-        u = coverage.uncertainty(self.memory.coverage)
-        seen = Seen(
-            camera=camera,
-            images=frame.colors.detach().permute(2, 0, 1)[None],
-            alphas=frame.alphas.detach(),
-            weights=coverage.uncertainty_map(gaussians, u, camera, self.backend),
-            depth=None if frame.depths is None else expected_depth(frame.depths.detach(), frame.alphas.detach()),
-            references=self._references(gaussians, camera),
-        )
+        frame, seen = self._see(camera, background, gaussians, settings)
         v_images = self.weight * self.pull(step, index, seen)
         if not bool(torch.isfinite(v_images).all()):
             raise NumericalError(
@@ -187,6 +179,35 @@ class Guide:
         for name in GEOMETRY:
             getattr(gradients, name).mul_(self.config.geometry)
         return gradients
+
+    def _see(
+        self, camera: Cameras, background: Float[Tensor, "3"], gaussians: Gaussians, settings: RasterSettings
+    ) -> tuple[Frame, Seen]:
+        """A render, and what is known about it."""
+        assert self.memory.coverage is not None
+        frame = self.backend.forward(gaussians, camera, settings, background, depth=self.prior.aligned)
+        u = coverage.uncertainty(self.memory.coverage)
+        return frame, Seen(
+            camera=camera,
+            images=frame.colors.detach().permute(2, 0, 1)[None],
+            alphas=frame.alphas.detach(),
+            uncertainty=coverage.uncertainty_map(gaussians, u, camera, self.backend),
+            depth=None if frame.depths is None else expected_depth(frame.depths.detach(), frame.alphas.detach()),
+            references=self._references(gaussians, camera),
+        )
+
+    def repair(self, step: int, view: View, gaussians: Gaussians, settings: RasterSettings) -> float:
+        """By how many dB the prior's answer, asked as in this step, is closer to a view than the render is."""
+        self._look_around(step, gaussians)
+        background = self._background(step)
+        truth = square_views([view], self.prior.size, background)
+        _, seen = self._see(truth.cameras, background, gaussians, settings)
+        answer = self._answer(step, 0, seen)
+        before, after = (
+            psnr(images.clamp(0, 1).permute(0, 2, 3, 1), truth.images.permute(0, 2, 3, 1)).clamp(max=MOST_PSNR)
+            for images in (seen.images, answer)
+        )
+        return float(after - before)
 
     def _references(self, gaussians: Gaussians, camera: Cameras) -> References | None:
         """The input views nearest to a camera, with the depth of the current Gaussians in them."""
@@ -198,11 +219,12 @@ class Guide:
 
     def pull(self, step: int, index: int, seen: Seen) -> Images:
         """dL/d(images) of the policy's loss, lambda left out."""
-        images, weights = seen.images, seen.weights
+        images, weights = seen.images, self._weights(seen)
         if self.config.policy == "recon":
             target = self._target(step, index, seen)
-            self._remember(step, index, "", images, weights, None, target[0])
-            return policies.pixel_pull(images, target, weights)
+            self._remember(step, index, "", seen, None, target[0])
+            # A mean over the subject's pixels: how much of the picture it fills does not matter.
+            return policies.pixel_pull(images, target, weights / seen.alphas.mean().clamp_min(SMALLEST))
         with torch.enable_grad():
             leaf = images.clone().requires_grad_()
             z = self.prior.encode(leaf)
@@ -211,19 +233,21 @@ class Guide:
             pull = policies.sdi(self.prior, z, look, self.config.inversion_steps)
         else:
             pull = policies.sds(self.prior, z, look)
-        self._remember(step, index, drawn, images, weights, pull.x0, None)
+        self._remember(step, index, drawn, seen, pull.x0, None)
         # Divided by numel only after the encoder's backward pass: half precision would lose so small a gradient.
         (v_images,) = torch.autograd.grad(z, leaf, policies.resized(weights, z) * pull.g)
         return v_images / z.numel()
+
+    def _weights(self, seen: Seen) -> Float[Tensor, "S S"]:
+        """Of every pixel: `certain_weight` where the inputs decide, 1 where they say nothing, 0 beside the subject."""
+        certain = sure(self.config.certain_weight)
+        return certain * seen.alphas + (1 - certain) * seen.uncertainty
 
     def _target(self, step: int, index: int, seen: Seen) -> Images:
         """recon's target for a candidate: denoised anew when it is too old, rounded to what a checkpoint keeps."""
         memory = self.memory
         if index not in memory.targets or step - memory.target_steps[index] >= self.config.refresh_every:
-            with torch.no_grad():
-                z = self.prior.encode(seen.images)
-                _, look = self._look(step, index, seen, z)
-                target = self.prior.decode(policies.denoised(self.prior, z, look, self._denoise_steps))
+            target = self._answer(step, index, seen)
             if not bool(torch.isfinite(target).all()):
                 raise NumericalError(
                     f"The decoded target of step {step} is not finite. Choose --guidance.dtype float32."
@@ -231,6 +255,13 @@ class Guide:
             memory.targets[index] = (target[0].cpu().clamp(0, 1) * 255).round().to(torch.uint8)
             memory.target_steps[index] = step
         return memory.targets[index][None].float() / 255
+
+    @torch.no_grad()
+    def _answer(self, step: int, index: int, seen: Seen) -> Images:
+        """The image that the prior thinks should be there."""
+        z = self.prior.encode(seen.images)
+        _, look = self._look(step, index, seen, z)
+        return self.prior.decode(policies.denoised(self.prior, z, look, sure(self.config.denoise_steps)))
 
     def _look(self, step: int, index: int, seen: Seen, z: Latents) -> tuple[str, policies.Look]:
         """This step's noise level, noise and conditions, and the text among the latter."""
@@ -244,7 +275,7 @@ class Guide:
             class_embedding=drawn.class_embedding,
             render=torch.cat([seen.images[0].clamp(0, 1), seen.alphas[None]]),
             depth=seen.depth,
-            uncertainty=seen.weights,
+            uncertainty=seen.uncertainty,
             camera=seen.camera,
             references=seen.references,
         )
@@ -253,7 +284,7 @@ class Guide:
             t=self.prior.schedule.step(share),
             eps=torch.randn(z.shape, generator=random).to(z),
             pair=Pair(positive, negative),
-            scale=Scale(self._guidance_scale, self.config.rescale, self.config.sequential),
+            scale=Scale(sure(self.config.guidance_scale), self.config.rescale, self.config.sequential),
             weighting=self.config.weighting,
             clip_rms=self.config.clip_rms,
         )
@@ -285,12 +316,11 @@ class Guide:
         step: int,
         index: int,
         text: str,
-        images: Images,
-        weights: Float[Tensor, "S S"],
+        seen: Seen,
         x0: Latents | None,
         target: Float[Tensor, "3 S S"] | None,
     ) -> None:
-        self.sample = Sample(step, index, text, images[0], weights, x0, target)
+        self.sample = Sample(step, index, text, seen.images[0], seen.uncertainty, x0, target)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """All that the next guided step depends on beside the Gaussians: tensors, and what JSON can hold."""

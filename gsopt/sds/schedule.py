@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.guidance_config import GuidanceConfig, sure
 
 # Configurations here are settled ones (`guidance_config.settled`): nothing in them is left open.
 
@@ -22,13 +22,13 @@ def last_step(config: GuidanceConfig, iterations: int) -> int:
 def is_guided(step: int, config: GuidanceConfig, iterations: int) -> bool:
     """Whether the schedule wants guidance in this step; coverage may still decide against it."""
     first = first_step(config, iterations)
-    return first <= step <= last_step(config, iterations) and (step - first) % _every(config) == 0
+    return first <= step <= last_step(config, iterations) and (step - first) % sure(config.every) == 0
 
 
 def guided_steps(config: GuidanceConfig, iterations: int) -> int:
     """How many steps the schedule wants guided."""
     first, last = first_step(config, iterations), last_step(config, iterations)
-    return 0 if last < first else (last - first) // _every(config) + 1
+    return 0 if last < first else (last - first) // sure(config.every) + 1
 
 
 def noise_range(step: int, config: GuidanceConfig, iterations: int) -> tuple[float, float]:
@@ -40,8 +40,3 @@ def noise_range(step: int, config: GuidanceConfig, iterations: int) -> tuple[flo
     progress = min(1.0, max(0.0, (step - first) / max(1, last - first)))
     fall = math.sqrt(progress) if config.anneal == "sqrt" else progress
     return config.t_min, config.t_max + (config.t_max_end - config.t_max) * fall
-
-
-def _every(config: GuidanceConfig) -> int:
-    assert config.every is not None
-    return config.every

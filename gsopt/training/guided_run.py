@@ -6,7 +6,7 @@ from typing import Any
 
 from gsopt.config import TrainConfig
 from gsopt.data.scene import Scene
-from gsopt.guidance_config import settled
+from gsopt.guidance_config import settled, sure
 from gsopt.init import first_gaussians
 from gsopt.raster.backend import Backend
 from gsopt.sds.choice import choose, fitting
@@ -67,7 +67,7 @@ def decided(config: TrainConfig, scene: Scene, guide: Guide) -> bool:
     degree = schedule.max_sh_degree(config, len(scene.train))
     gaussians, _ = first_gaussians(scene, config.init, degree, config.seed)
     covered = coverage(gaussians, guide.inputs, guide.backend)
-    return bool((guide.mean_uncertainty(gaussians, covered) < config.guidance.min_uncertainty).all())
+    return bool((guide.mean_uncertainty(gaussians, covered) < sure(guide.config.min_uncertainty)).all())
 
 
 def _told(verdict: Verdict, prior: str, policy: str) -> dict[str, Any]:

@@ -1,8 +1,13 @@
 """The guard: short runs without one input view say whether guidance helps there, before the run itself is guided.
 
-A view the model has learned from cannot tell: any prior only blurs what is known. So every view that is left out gets
-models that never saw it, first Gaussians included: one without guidance and one with, the same in all else. Where
-guidance lowers the mean PSNR of the left-out views its weight is halved and tried again; after three trials it is 0.
+A view the model has learned from cannot tell: any prior only blurs what is known. So every view that is left out gets a
+model that never saw it, first Gaussians included.
+
+A view-conditioned prior is asked what that model's render should look like: only one whose answers are closer to the
+left-out views, by REPAIR at least, guides the run. What a run gains follows from that (docs/howto/guidance.md).
+
+Of a text-to-image prior single answers tell little. There a second model is guided, the same in all else. Where that
+lowers the mean PSNR of the left-out views, lambda is halved and tried again; after three trials it is 0.
 """
 
 from __future__ import annotations
@@ -19,10 +24,12 @@ from gsopt.cameras import Cameras
 from gsopt.config import InitConfig, ScheduleConfig, TrainConfig
 from gsopt.data.scene import Scene, View
 from gsopt.data.split import farthest_points
+from gsopt.errors import NumericalError
 from gsopt.guidance_config import settled
 from gsopt.init import first_gaussians
 from gsopt.metrics import psnr
-from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.raster.backend import Backend
+from gsopt.sds import schedule as sds_schedule
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.guidance import Warn
 from gsopt.sds.prior import Prior
@@ -31,6 +38,11 @@ from gsopt.training.guidance import RunGuidance, make_guide
 from gsopt.training.targets import Targets
 from gsopt.training.trainer import Trainer
 
+REPAIR = 0.2
+"""dB. Fits with a view less are easier to repair than the run's own: by this much, a prior that knows nothing more may
+seem to help."""
+LOOKS = 4
+"""Noise levels at which a prior is asked about each left-out view, those of the guided steps."""
 FACTORS = (1.0, 0.5, 0.25)
 SIDE = 128
 """Longer side of the images of a short run, px, as near as halving comes."""
@@ -48,7 +60,8 @@ class Verdict:
     """On lambda."""
     reason: str
     trials: list[dict[str, Any]]
-    """Per trial: factor, and mean PSNR of the left-out views with and without guidance, dB."""
+    """Per left-out view: its name and by how many dB it was repaired. Or, of a text-to-image prior, per trial: factor,
+    and mean PSNR of the left-out views with and without guidance, dB."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +85,7 @@ def judge_guidance(
     front: Cameras,
     warn: Warn,
 ) -> Verdict:
-    """The largest factor on `weight` for which guidance does not lower the PSNR of input views that were left out."""
+    """How much of `weight` the run should have, going by input views that were left out."""
     guidance = config.guidance
     if guidance.guard_views == 0:
         return Verdict(1.0, "not checked: --guidance.guard-views is 0", [])
@@ -80,10 +93,37 @@ def judge_guidance(
         return Verdict(1.0, "not checked: there is only one input view", [])
     short = short_config(config, scene, prior.aligned)
     lefts = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
-    lefts = [replace(left, plain=_psnr(short, left, backend, None)) for left in lefts]
+    aid = prior, conditioning, weight, front, warn
+    return _repairs(short, lefts, backend, aid) if prior.aligned else _helps(short, lefts, backend, aid)
+
+
+def _repairs(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid) -> Verdict:
+    """Whether the prior's answers are closer to the left-out views than what it is shown."""
+    guidance = settled(config.guidance, view_conditioned=True)
+    first, last = (of(guidance, config.iterations) for of in (sds_schedule.first_step, sds_schedule.last_step))
+    steps = [first + (last - first) * look // (LOOKS - 1) for look in range(LOOKS)]
+    repairs: dict[str, float] = {}
+    for left in lefts:
+        trainer = _trained(config, left, backend, None)
+        guide, gaussians = make_guide(config, left.scene, backend, *aid), trainer.model.gaussians
+        try:
+            found = [guide.repair(step, left.view, gaussians, trainer.settings()) for step in steps]
+        except NumericalError as error:
+            return Verdict(0.0, f"the prior failed: {error}", [])
+        repairs[left.view.name] = round(sum(found) / LOOKS, 4)
+    mean = sum(repairs.values()) / len(repairs)
+    trials = [{"view": name, "repair": repair} for name, repair in repairs.items()]
+    said = f"its answers are {mean:+.2f} dB closer to left-out views than the renders"
+    return Verdict(1.0, said, trials) if mean >= REPAIR else Verdict(0.0, f"{said}, {REPAIR:g} are asked for", trials)
+
+
+def _helps(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid) -> Verdict:
+    """The largest factor on lambda at which a guided short run is no worse than one that is not."""
+    prior, conditioning, weight, front, warn = aid
+    lefts = [replace(left, plain=_psnr(config, left, backend, None)) for left in lefts]
     trials = []
     for factor in FACTORS:
-        made = [_psnr(short, left, backend, (prior, conditioning, factor * weight, front, warn)) for left in lefts]
+        made = [_psnr(config, left, backend, (prior, conditioning, factor * weight, front, warn)) for left in lefts]
         plain, guided = (sum(values) / len(lefts) for values in ([left.plain for left in lefts], made))
         trials.append({"factor": factor, "plain": round(plain, 4), "guided": round(guided, 4)})
         if guided >= plain:
@@ -131,18 +171,21 @@ def short_run(
     config: TrainConfig, left: Left, backend: Backend, guide: Aid | None
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
     """The left-out view after a short run on the others, 0..1 on white, and how it really looks."""
+    trainer = _trained(config, left, backend, guide)
+    target = Targets([left.view], WHITE, 0).get(0, schedule.downscale(1, config.schedule.coarse_until or ()), WHITE)
+    colors = backend.forward(trainer.model.gaussians, target.camera, trainer.settings(), WHITE).colors
+    return colors.clamp(0, 1), target.colors
+
+
+def _trained(config: TrainConfig, left: Left, backend: Backend, guide: Aid | None) -> Trainer:
+    """A short run at its end."""
     degree = schedule.max_sh_degree(config, len(left.scene.train))
     gaussians, _ = first_gaussians(left.scene, config.init, degree, config.seed)
-    guidance = None
-    if guide is not None:
-        guidance = RunGuidance(make_guide(config, left.scene, backend, *guide))
+    guidance = None if guide is None else RunGuidance(make_guide(config, left.scene, backend, *guide))
     trainer = Trainer(config, left.scene, gaussians, backend, guidance)
     while trainer.step < config.iterations:
         trainer.advance()
-    target = Targets([left.view], WHITE, 0).get(0, schedule.downscale(1, config.schedule.coarse_until or ()), WHITE)
-    settings = RasterSettings(sh_degree=degree, antialiased=config.antialiased)
-    colors = backend.forward(trainer.model.gaussians, target.camera, settings, WHITE).colors
-    return colors.clamp(0, 1), target.colors
+    return trainer
 
 
 def _psnr(config: TrainConfig, left: Left, backend: Backend, guide: Aid | None) -> float:

@@ -24,7 +24,14 @@ from gsopt.sds.guidance import MOST_FAILURES, Guide, Seen
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)
 ALWAYS = GuidanceConfig(
-    policy="sds", start=0.0, stop=1.0, every=1, min_uncertainty=0.0, guidance_scale=1.0, clip_rms=0.0
+    policy="sds",
+    start=0.0,
+    stop=1.0,
+    every=1,
+    min_uncertainty=0.0,
+    certain_weight=0.0,
+    guidance_scale=1.0,
+    clip_rms=0.0,
 )
 SIZE = 16
 NO_WORDS = Conditioning("", (), ("",), None, None, None)
@@ -77,7 +84,7 @@ def toy(**changes) -> PixelPrior:
 
 def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
     """All the way to the colors: lambda · dL/d(color) by central differences of the loss with g held fixed."""
-    guided, gaussians = guide(toy()), blobs()
+    guided, gaussians = guide(toy(), replace(ALWAYS, certain_weight=0.25)), blobs()
     found = guided.gradients(7, gaussians, SETTINGS)
     assert found is not None
     sample = guided.sample
@@ -88,17 +95,15 @@ def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
         colors = BACKEND.forward(replace(gaussians, sh0=sh0), camera, SETTINGS, torch.ones(3)).colors
         return (2 * colors.permute(2, 0, 1)[None] - 1).double()
 
-    z = z_of(gaussians.sh0)
+    z, alphas = z_of(gaussians.sh0), BACKEND.forward(gaussians, camera, SETTINGS, torch.ones(3)).alphas
     assert sample.x0 is not None
-    seen = Seen(camera, (z.float() + 1) / 2, torch.zeros(SIZE, SIZE), sample.uncertainty)
+    seen = Seen(camera, (z.float() + 1) / 2, alphas, sample.uncertainty)
     _, look = guided._look(7, sample.view, seen, z.float())
+    weights = (0.25 * alphas + 0.75 * sample.uncertainty).double()
     g = policies.sds(guided.prior, z.float(), look).g.double()
     direction, h = torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(1)), 1e-3
     ahead, behind = (
-        0.2
-        * float(
-            0.5 * (sample.uncertainty.double() * (z_of(gaussians.sh0 + s * h * direction) - (z - g)).square()).mean()
-        )
+        0.2 * float(0.5 * (weights * (z_of(gaussians.sh0 + s * h * direction) - (z - g)).square()).mean())
         for s in (1, -1)
     )
     assert float((found.sh0 * direction).sum()) == pytest.approx((ahead - behind) / (2 * h), rel=1e-3)
@@ -111,15 +116,37 @@ def test_steps_towards_a_prior_that_knows_the_answer_reach_it(policy) -> None:
     config = replace(ALWAYS, policy=policy, weighting="x0", refresh_every=1, inversion_steps=2, denoise_steps=2)
     background = (target[:, 0, 0] + 1) / 2
     guided = guide(PixelPrior(knows(target), size=SIZE), config, background=background, iterations=120)
-    gaussians = blobs()
+    gaussians, rate = blobs(), 1000 if policy == "recon" else 3000  # recon's loss is a mean over the subject alone
     distances = []
     for step in range(1, 121):
         found = guided.gradients(step, gaussians, SETTINGS)
         assert found is not None
         assert guided.sample is not None
         distances.append(float((2 * guided.sample.render - 1 - target).abs().mean()))
-        gaussians = replace(gaussians, sh0=gaussians.sh0 - 3000 * found.sh0)
+        gaussians = replace(gaussians, sh0=gaussians.sh0 - rate * found.sh0)
     assert sum(distances[-5:]) < 0.25 * sum(distances[:5])
+
+
+def test_empty_surroundings_do_not_weaken_a_target() -> None:
+    """The same subject in a picture twice as wide is pulled alike: what is certain a quarter as hard as told, what is
+    beside the subject not at all."""
+    guided = guide(toy(), replace(ALWAYS, policy="recon", certain_weight=0.25))
+    alphas = torch.zeros(SIZE, SIZE)
+    alphas[4:12, 4:12] = 1.0
+    u = 0.5 * alphas
+    u[:8] = 0
+    pulls = []
+    for border in (0, 8):
+        known, free = (torch.nn.functional.pad(plane, [border] * 4) for plane in (alphas, u))
+        side = SIZE + 2 * border
+        guided.memory.targets[0], guided.memory.target_steps[0] = torch.zeros(3, side, side, dtype=torch.uint8), 1
+        seen = Seen(guided.rig.camera(0), torch.ones(1, 3, side, side), known, free)
+        pulls.append(guided.pull(1, 0, seen)[0, 0, border : side - border, border : side - border])
+    torch.testing.assert_close(pulls[1], pulls[0])
+    each = 1 / (3 * 8 * 8)  # dL/dx of a channel of one of the subject's pixels, where nothing is known
+    assert float(pulls[0][5, 5]) == pytest.approx(0.25 * each, rel=1e-3)
+    assert float(pulls[0][9, 9]) == pytest.approx((0.25 + 0.75 * 0.5) * each, rel=1e-3)
+    assert float(pulls[0][0, 0]) == 0
 
 
 @pytest.mark.parametrize("policy", ["sds", "sdi", "recon"])

@@ -269,5 +269,9 @@ def test_what_is_left_open_is_settled_by_the_kind_of_prior_and_what_was_said_sta
     view, text = (settled(GuidanceConfig(), view_conditioned=kind) for kind in (True, False))
     assert (view.policy, view.every, view.guidance_scale, view.denoise_steps) == ("recon", 2, 1.0, 1)
     assert (text.policy, text.every, text.guidance_scale, text.denoise_steps) == ("sds", 10, 3.0, 5)
-    said = GuidanceConfig(policy="sds", every=7, guidance_scale=5.0, denoise_steps=3)
+    assert (view.min_uncertainty, view.certain_weight) == (0.0, 1.0)
+    assert (text.min_uncertainty, text.certain_weight) == (0.05, 0.0)
+    said = GuidanceConfig(
+        policy="sds", every=7, guidance_scale=5.0, denoise_steps=3, min_uncertainty=0.1, certain_weight=0.3
+    )
     assert settled(said, view_conditioned=True) == said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,14 @@ import pytest
 import torch
 from tiny_scenes import tiny_config
 
-from gsopt.config import TrainConfig
+from gsopt.config import DataConfig, TrainConfig
+from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
 from gsopt.events import read_events
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.sds.conditioning import Conditioning
+from gsopt.sds.prior import Condition
+from gsopt.sds.views import square_views
 from gsopt.training import guided_run
 from gsopt.training.loop import train
 from gsopt.training.trainer import Trainer
@@ -104,13 +108,53 @@ def test_a_prior_that_answers_nan_never_loses_the_reconstruction(
     assert "without guidance" in (tmp_path / "run" / "events.jsonl").read_text()
 
 
-def test_the_guard_turns_off_what_hurts_and_keeps_what_helps(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+def guard_of(run: Path) -> dict:
+    return json.loads((run / "config.json").read_text())["guidance"]["guard"]
+
+
+def test_the_guard_lowers_what_makes_short_runs_worse(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    """Of a text-to-image prior."""
+    prior.aligned = False
     prior.answer = lambda x_t, a, c: -torch.ones_like(x_t)  # everything is black
     hurting = config(dataset, guard_views=1, guard_steps=40, lambda_sds=50.0, weighting="x0", clip_rms=0.0)
     train(hurting, tmp_path / "run")
-    guard = json.loads((tmp_path / "run" / "config.json").read_text())["guidance"]["guard"]
+    guard = guard_of(tmp_path / "run")
     assert guard["factor"] < 1
     assert guard["trials"][0]["guided"] < guard["trials"][0]["plain"]
+
+
+@pytest.mark.parametrize(("share", "factor"), [(0.5, 1.0), (0.01, 0.0), (-0.1, 0.0)])
+def test_the_guard_asks_a_view_conditioned_prior_about_left_out_views(
+    share: float, factor: float, dataset: Path, tmp_path: Path, prior: PixelPrior
+) -> None:
+    """One that takes this share of a render's error away repairs by -20 log10(1 - share) dB: enough or not."""
+    views = load_scene(DataConfig(path=str(dataset))).train
+
+    def answer(x_t: torch.Tensor, a: torch.Tensor, condition: Condition) -> torch.Tensor:
+        assert condition.render is not None
+        assert condition.camera is not None
+        same = [v for v in views if torch.allclose(v.camera.viewmats, condition.camera.viewmats)]
+        render = condition.render[:3]
+        truth = square_views(same, 16, torch.ones(3)).images[0] if same else render
+        return 2 * (render + share * (truth - render)) - 1
+
+    prior.answer = answer
+    train(config(dataset, guard_views=2, guard_steps=20), tmp_path / "run")
+    guard = guard_of(tmp_path / "run")
+    assert guard["factor"] == factor
+    assert len(guard["trials"]) == 2
+    for trial in guard["trials"]:
+        assert trial["repair"] == pytest.approx(-20 * math.log10(1 - share), abs=0.05)
+    guided = json.loads((tmp_path / "run" / "guidance" / "summary.json").read_text())["guided"]
+    assert (guided > 0) == (factor > 0)
+
+
+def test_a_prior_that_fails_the_guard_by_failing_is_off(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    prior.answer = lambda x_t, a, c: torch.full_like(x_t, float("nan"))
+    train(config(dataset, guard_views=1, guard_steps=20), tmp_path / "run")
+    guard = guard_of(tmp_path / "run")
+    assert guard["factor"] == 0
+    assert "not finite" in guard["reason"] or "answered nan" in guard["reason"]
 
 
 def test_a_corrupt_reference_image_stops_before_any_training(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
