@@ -1,11 +1,12 @@
 #!/bin/sh
-# How gsopt/sds/embedded was made: renders of meshes, reconstructions of them from few views, training in two courses.
+# How gsopt/sds/embedded was made: renders of meshes, reconstructions of them from few views, training in three courses.
 #
 #     scripts/train_embedded_prior.sh BLENDER_PYTHON MESHES SPLITS LIBRARIES OUT
 #
 # BLENDER_PYTHON has bpy; MESHES holds MANIFEST.json and the meshes it lists; SPLITS is a JSON file with the names under
 # `train` and `val`; LIBRARIES are the unpacked archives of sweethome3d-furniture (more_models.py). Interrupted, the same
-# command goes on. The first course ran before the second was thought of, with the visual hull of that time.
+# command goes on. Each course ran before the next was thought of, with the first shapes, the mirror images and the loss of
+# its time: what this makes today is not the same to the bit.
 set -eu
 blender_python=$1 meshes=$2 splits=$3 libraries=$4 out=$5
 mkdir -p "$out"
@@ -36,5 +37,8 @@ held_out=$(python -c 'import json, sys; print(*(row["id"] for row in json.load(o
 gsopt finetune "$out/train" "$out/val" -o "$out/first" --val $held_out --fits 1 --steps 2500 --lr 5e-4 --threads 1 \
     --clip-steps 0
 # shellcheck disable=SC2086
-gsopt finetune "$out/train" "$out/more" "$out/val" -o "$out/prior" --base "$out/first" --val $held_out --fits 1 \
+gsopt finetune "$out/train" "$out/more" "$out/val" -o "$out/second" --base "$out/first" --val $held_out --fits 1 \
     --steps 3200 --lr 4e-4 --threads 1
+# shellcheck disable=SC2086
+gsopt finetune "$out/train" "$out/more" "$out/val" -o "$out/prior" --base "$out/second" --val $held_out --fits 2 \
+    --steps 3600 --lr 4e-4 --threads 1

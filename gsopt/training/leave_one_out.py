@@ -38,7 +38,7 @@ from gsopt.training.guidance import RunGuidance, make_guide
 from gsopt.training.targets import Targets
 from gsopt.training.trainer import Trainer
 
-REPAIR = 0.2
+REPAIR = 0.5
 """dB. Fits with a view less are easier to repair than the run's own: by this much, a prior that knows nothing more may
 seem to help."""
 LOOKS = 4
