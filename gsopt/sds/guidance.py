@@ -88,7 +88,7 @@ class Memory:
     """Mean uncertainty of every candidate camera, as old as `coverage`."""
     coverage_step: int = 0
     targets: dict[int, Tensor] = field(default_factory=dict)
-    """recon: uint8 [3, S, S] per candidate."""
+    """recon: uint8 [2, 3, S, S] per candidate, a render and what the prior made of it."""
     target_steps: dict[int, int] = field(default_factory=dict)
 
 
@@ -221,10 +221,11 @@ class Guide:
         """dL/d(images) of the policy's loss, lambda left out."""
         images, weights = seen.images, self._weights(seen)
         if self.config.policy == "recon":
-            target = self._target(step, index, seen)
+            asked, target = self._target(step, index, seen)
             self._remember(step, index, "", seen, None, target[0])
             # A mean over the subject's pixels: how much of the picture it fills does not matter.
-            return policies.pixel_pull(images, target, weights / seen.alphas.mean().clamp_min(SMALLEST))
+            weights = weights / seen.alphas.mean().clamp_min(SMALLEST)
+            return policies.pixel_pull(images, target, weights * policies.wanted(images, asked, target))
         with torch.enable_grad():
             leaf = images.clone().requires_grad_()
             z = self.prior.encode(leaf)
@@ -243,8 +244,9 @@ class Guide:
         certain = sure(self.config.certain_weight)
         return certain * seen.alphas + (1 - certain) * seen.uncertainty
 
-    def _target(self, step: int, index: int, seen: Seen) -> Images:
-        """recon's target for a candidate: denoised anew when it is too old, rounded to what a checkpoint keeps."""
+    def _target(self, step: int, index: int, seen: Seen) -> tuple[Images, Images]:
+        """recon's target for a candidate and the render it was made of: made anew when it is too old, rounded to what
+        a checkpoint keeps."""
         memory = self.memory
         if index not in memory.targets or step - memory.target_steps[index] >= self.config.refresh_every:
             target = self._answer(step, index, seen)
@@ -252,9 +254,11 @@ class Guide:
                 raise NumericalError(
                     f"The decoded target of step {step} is not finite. Choose --guidance.dtype float32."
                 )
-            memory.targets[index] = (target[0].cpu().clamp(0, 1) * 255).round().to(torch.uint8)
+            pair = torch.cat([seen.images, target.to(seen.images)]).cpu()
+            memory.targets[index] = (pair.clamp(0, 1) * 255).round().to(torch.uint8)
             memory.target_steps[index] = step
-        return memory.targets[index][None].float() / 255
+        asked, target = (memory.targets[index].float() / 255).split(1)
+        return asked, target
 
     @torch.no_grad()
     def _answer(self, step: int, index: int, seen: Seen) -> Images:

@@ -12,6 +12,11 @@ recon compares pixels instead, by the distance that most of the photometric loss
 
     (2)  L = mean( u sqrt((x - y)^2 + e^2) ),   y denoised from z_t, e = ROUND
 
+y is kept for some hundred steps, in which the render goes on from the x' it was made of. What the prior wanted is y - x',
+so u is multiplied by how much that is, and by 0 where the render has passed y by itself: else an old target, which is
+mostly an old render, would hold the reconstruction back.
+
+    (3)  u' = u c^2 / (c^2 + SURE^2) [c (y - x) > 0],   c = y - x'
 """
 
 from __future__ import annotations
@@ -27,6 +32,9 @@ from gsopt.sds.prior import Images, Pair, Prior, Scale, guided_x0
 
 ROUND = 0.01
 """Differences well below this count by their square: no gradient jumps where the render has arrived."""
+
+SURE = 0.05
+"""Changes well below this are not what a prior wants, but what it cannot know better."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +121,14 @@ def loss(z: Latents, g: Latents, weights: Float[Tensor, "B 1 h w"]) -> Float[Ten
     return 0.5 * (weights * (z - target).square()).mean()
 
 
-def pixel_pull(images: Images, target: Images, weights: Float[Tensor, "S S"]) -> Images:
+def wanted(images: Images, asked: Images, target: Images) -> Images:
+    """Equation (3) without u; `asked` is the render that `target` was made of."""
+    change = target - asked
+    share = change.square() / (change.square() + SURE**2)
+    return share * (change * (target - images.detach()) > 0)
+
+
+def pixel_pull(images: Images, target: Images, weights: Images | Float[Tensor, "S S"]) -> Images:
     """dL/dx of equation (2)."""
     apart = images.detach() - target
     return weights * apart / (apart.square() + ROUND**2).sqrt() / apart.numel()

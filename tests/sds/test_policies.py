@@ -265,6 +265,17 @@ def test_the_pull_of_recon_is_the_gradient_of_its_loss() -> None:
     assert float(found[..., 0, :].abs().max()) == float(found[..., 0].abs().max()) == 0
 
 
+def test_an_old_target_pulls_only_where_and_as_far_as_the_prior_wanted() -> None:
+    """Per value: no change was wanted; a large one is under way; it has been passed; a slight one."""
+    asked = torch.tensor([0.5, 0.5, 0.5, 0.5]).view(1, 1, 2, 2)
+    target = torch.tensor([0.5, 0.9, 0.9, 0.5 + policies.SURE]).view(1, 1, 2, 2)
+    images = torch.tensor([0.7, 0.6, 0.95, 0.5]).view(1, 1, 2, 2)
+    found = policies.wanted(images, asked, target).flatten()
+    assert found[0] == found[2] == 0
+    assert float(found[1]) == pytest.approx(1, abs=0.01)
+    assert float(found[3]) == pytest.approx(0.5, abs=1e-5)
+
+
 def test_what_is_left_open_is_settled_by_the_kind_of_prior_and_what_was_said_stays() -> None:
     view, text = (settled(GuidanceConfig(), view_conditioned=kind) for kind in (True, False))
     assert (view.policy, view.every, view.guidance_scale, view.denoise_steps) == ("recon", 2, 1.0, 1)
