@@ -145,8 +145,8 @@ def test_empty_surroundings_do_not_weaken_a_target() -> None:
         pulls.append(guided.pull(1, 0, seen)[0, 0, border : side - border, border : side - border])
     torch.testing.assert_close(pulls[1], pulls[0])
     each = 1 / (3 * 8 * 8)  # dL/dx of a channel of one of the subject's pixels, where nothing is known
-    assert float(pulls[0][5, 5]) == pytest.approx(0.25 * each, rel=2e-3)
-    assert float(pulls[0][9, 9]) == pytest.approx((0.25 + 0.75 * 0.5) * each, rel=2e-3)
+    assert float(pulls[0][5, 5]) == pytest.approx(0.25 * each, rel=5e-3)
+    assert float(pulls[0][9, 9]) == pytest.approx((0.25 + 0.75 * 0.5) * each, rel=5e-3)
     assert float(pulls[0][0, 0]) == 0
 
 

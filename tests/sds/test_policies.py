@@ -272,7 +272,7 @@ def test_an_old_target_pulls_only_where_and_as_far_as_the_prior_wanted() -> None
     images = torch.tensor([0.7, 0.6, 0.95, 0.5]).view(1, 1, 2, 2)
     found = policies.wanted(images, asked, target).flatten()
     assert found[0] == found[2] == 0
-    assert float(found[1]) == pytest.approx(1, abs=0.01)
+    assert float(found[1]) == pytest.approx(1, abs=0.02)
     assert float(found[3]) == pytest.approx(0.5, abs=1e-5)
 
 
