@@ -25,11 +25,11 @@ from gsopt.events import to_json, write_atomic
 ARMS: dict[str, list[str]] = {
     "off": ["--lambda-sds", "0"],
     "default": [],
-    "default, no guard": ["--guidance.guard-views", "0"],
     "recon": ["--guidance.policy", "recon", "--guidance.guard-views", "0"],
     "sds": ["--guidance.policy", "sds", "--guidance.guard-views", "0"],
-    "sds, no references": ["--guidance.policy", "sds", "--guidance.guard-views", "0", "--guidance.references", "0"],
+    "sds, words": ["--guidance.policy", "sds", "--guidance.guard-views", "0", "--guidance.references", "0"],
 }
+"""All but `default` without the guard. `words`: no input view is shown, but the object's name is told."""
 METRICS = ("psnr", "ssim", "lpips_alex")
 
 
@@ -44,6 +44,8 @@ def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespac
     shutil.rmtree(folder, ignore_errors=True)
     flags = ["--views", str(views), "--seed", str(seed), "--iterations", str(options.iterations), "--threads", "1"]
     flags += ["--checkpoint-every", "0", "--preview-every", "0", *ARMS[arm]]
+    if arm == "sds, words":
+        flags += ["--prompt", json.loads((scene / "object.json").read_text())["name"]]
     if arm != "off" and options.prior:
         flags += ["--prior", options.prior]
     began = time.process_time()

@@ -12,9 +12,9 @@ recon compares pixels instead, by the distance that most of the photometric loss
 
     (2)  L = mean( u sqrt((x - y)^2 + e^2) ),   y denoised from z_t, e = ROUND
 
-y is kept for some hundred steps, in which the render goes on from the x' it was made of. What the prior wanted is y - x',
-so u is multiplied by how much that is, and by 0 where the render has passed y by itself: else an old target, which is
-mostly an old render, would hold the reconstruction back.
+y is kept for some hundred steps, in which the render goes on from the x' it was made of. What the prior wanted is
+y - x', so u is multiplied by how much that is, and by 0 where the render has passed y by itself: else an old target,
+which is mostly an old render, would hold the reconstruction back.
 
     (3)  u' = u c^2 / (c^2 + SURE^2) [c (y - x) > 0],   c = y - x'
 """
