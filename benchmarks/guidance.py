@@ -27,7 +27,16 @@ ARMS: dict[str, list[str]] = {
     "default": [],
     "recon": ["--guidance.policy", "recon", "--guidance.guard-views", "0"],
     "sds": ["--guidance.policy", "sds", "--guidance.guard-views", "0"],
-    "sds, words": ["--guidance.policy", "sds", "--guidance.guard-views", "0", "--guidance.references", "0"],
+    "sds, words": [
+        "--guidance.policy",
+        "sds",
+        "--guidance.guard-views",
+        "0",
+        "--guidance.references",
+        "0",
+        "--guidance.image-weight",
+        "0",
+    ],
 }
 """All but `default` without the guard. `words`: no input view is shown, but the object's name is told."""
 METRICS = ("psnr", "ssim", "lpips_alex")

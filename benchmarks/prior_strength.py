@@ -8,7 +8,7 @@ prior would be asked for a camera's image, the emulated one answers with
 
     (1)  y = r0 + s (y* - r0)
 
-r0 drawn from `off` and y* from `truth`. So it repairs what the unguided run got wrong by -20 log10(1 - s) dB in every
+r0 drawn from `off` and y* from `truth`. So it repairs what separates `off` from `truth` by -20 log10(1 - s) dB in every
 view, consistently: the most that a prior of that strength can do. `measured` records by how much a real one repairs the
 renders of `off` from the held-out cameras in one step. Runs that have a record are not made again.
 """

@@ -64,7 +64,7 @@ class GuidanceConfig:
     """Steps between two guided ones. When not given: 2 with recon, whose targets last; else 10."""
     min_uncertainty: float | None = None
     """Mean uncertainty of a view below which it is not guided: the input views decide there. When not given: 0.05; 0
-    for a view-conditioned prior, whose guard has measured that it knows more."""
+    for a view-conditioned prior, which the guard asks whether it knows more."""
     certain_weight: float | None = None
     """Weight of a pixel that the input views decide, next to 1 for one that none of them shows. When not given: 1 for a
     view-conditioned prior, which knows these views; 0 for a text-to-image prior, which knows better nowhere."""

@@ -50,6 +50,11 @@ def test_it_says_and_shows_what_guidance_did(tmp_path: Path) -> None:
     assert html.count("<img") == 2 * 4 + 3
 
 
+def test_it_says_the_weight_that_the_guard_left(tmp_path: Path) -> None:
+    halved = {**TOLD, "guard": {"factor": 0.5, "reason": "tried twice"}}
+    assert "lambda 0.1 (tried twice)" in section(write(tmp_path, halved), [])
+
+
 def test_a_run_without_guidance_has_no_such_part(tmp_path: Path) -> None:
     assert section(tmp_path, []) == ""
 

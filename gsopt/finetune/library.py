@@ -17,6 +17,8 @@ from gsopt.finetune.fits import Pairs, make_pairs
 from gsopt.raster.backend import Backend
 
 Say = Callable[[str], None]
+MADE_AS = 2
+"""Of what a pair shows; counted up when that changes, so that older files are made again."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Library:
 
 def _made_by(scene: Path, size: int, seed: int) -> str:
     """What a file of pairs depends on beside the fit's number: scenes of different folders may share a name."""
-    return hashlib.sha256(f"{scene.resolve()} {size} {seed}".encode()).hexdigest()[:8]
+    return hashlib.sha256(f"{scene.resolve()} {size} {seed} {MADE_AS}".encode()).hexdigest()[:8]
 
 
 def collect(

@@ -49,9 +49,12 @@ def counts(told: dict[str, Any]) -> str:
     guided, wanted, decided, failed = (_whole(told.get(key)) for key in ("guided", "wanted", "decided", "failed"))
     guard = told.get("guard")
     reason = guard.get("reason") if isinstance(guard, dict) else None
+    weight, factor = told.get("lambda_sds"), guard.get("factor", 1.0) if isinstance(guard, dict) else 1.0
+    if isinstance(weight, int | float) and isinstance(factor, int | float):
+        weight = f"{weight * factor:g}"
     sentences = [
         f"{told.get('model', 'A diffusion prior')}, policy {told.get('policy', 'unknown')}, "
-        f"lambda {told.get('lambda_sds', 'unknown')}" + (f" ({reason})." if reason else "."),
+        f"lambda {'unknown' if weight is None else weight}" + (f" ({reason})." if reason else "."),
         f"{guided} of {wanted} steps that the schedule wanted guided were guided.",
     ]
     if decided:

@@ -339,13 +339,16 @@ class Guide:
         return tensors, meta
 
     def restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-        """Inverse of `state`."""
+        """Inverse of `state`. ValueError for targets of another version."""
+        targets = {int(k.removeprefix("target.")): v for k, v in tensors.items() if k.startswith("target.")}
+        if any(target.shape[:-2] != (2, 3) for target in targets.values()):
+            raise ValueError("targets of the guidance that another version of gsopt made")
         self.counts = Counts(**{item.name: meta["counts"][item.name] for item in fields(Counts)})
         self.memory = Memory(
             coverage=tensors.get("coverage"),
             mean_u=tensors.get("mean_u"),
             coverage_step=int(meta["coverage_step"]),
-            targets={int(k.removeprefix("target.")): v for k, v in tensors.items() if k.startswith("target.")},
+            targets=targets,
             target_steps={int(index): int(step) for index, step in meta["target_steps"].items()},
         )
 

@@ -64,10 +64,13 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
 
 def decided(config: TrainConfig, scene: Scene, guide: Guide) -> bool:
     """Whether the input views see the first Gaussians from everywhere: then no step would be guided."""
+    least = sure(guide.config.min_uncertainty)
+    if least == 0:
+        return False
     degree = schedule.max_sh_degree(config, len(scene.train))
     gaussians, _ = first_gaussians(scene, config.init, degree, config.seed)
     covered = coverage(gaussians, guide.inputs, guide.backend)
-    return bool((guide.mean_uncertainty(gaussians, covered) < sure(guide.config.min_uncertainty)).all())
+    return bool((guide.mean_uncertainty(gaussians, covered) < least).all())
 
 
 def _told(verdict: Verdict, prior: str, policy: str) -> dict[str, Any]:

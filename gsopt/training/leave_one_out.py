@@ -71,8 +71,6 @@ class Left:
     scene: Scene
     """Without it."""
     view: View
-    plain: float
-    """Its PSNR without guidance, dB."""
 
 
 def judge_guidance(
@@ -90,7 +88,8 @@ def judge_guidance(
     if guidance.guard_views == 0:
         return Verdict(1.0, "not checked: --guidance.guard-views is 0", [])
     if len(scene.train) < 2:
-        return Verdict(1.0, "not checked: there is only one input view", [])
+        only = "one input view cannot say whether it helps"
+        return Verdict(0.0, f"off: {only}", []) if prior.aligned else Verdict(1.0, f"not checked: {only}", [])
     short = short_config(config, scene, prior.aligned)
     lefts = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
     aid = prior, conditioning, weight, front, warn
@@ -99,8 +98,7 @@ def judge_guidance(
 
 def _repairs(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid) -> Verdict:
     """Whether the prior's answers are closer to the left-out views than what it is shown."""
-    guidance = settled(config.guidance, view_conditioned=True)
-    first, last = (of(guidance, config.iterations) for of in (sds_schedule.first_step, sds_schedule.last_step))
+    first, last = (of(config.guidance, config.iterations) for of in (sds_schedule.first_step, sds_schedule.last_step))
     steps = [first + (last - first) * look // (LOOKS - 1) for look in range(LOOKS)]
     repairs: dict[str, float] = {}
     for left in lefts:
@@ -120,11 +118,11 @@ def _repairs(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid)
 def _helps(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid) -> Verdict:
     """The largest factor on lambda at which a guided short run is no worse than one that is not."""
     prior, conditioning, weight, front, warn = aid
-    lefts = [replace(left, plain=_psnr(config, left, backend, None)) for left in lefts]
+    plain = sum(_psnr(config, left, backend, None) for left in lefts) / len(lefts)
     trials = []
     for factor in FACTORS:
         made = [_psnr(config, left, backend, (prior, conditioning, factor * weight, front, warn)) for left in lefts]
-        plain, guided = (sum(values) / len(lefts) for values in ([left.plain for left in lefts], made))
+        guided = sum(made) / len(lefts)
         trials.append({"factor": factor, "plain": round(plain, 4), "guided": round(guided, 4)})
         if guided >= plain:
             names = ", ".join(left.view.name for left in lefts)
@@ -155,10 +153,10 @@ def short_config(config: TrainConfig, scene: Scene, view_conditioned: bool) -> T
 
 
 def without(scene: Scene, index: int) -> Left:
-    """The scene without one of its input views and that one's mirror images; its PSNR is not measured yet."""
+    """The scene without one of its input views and that one's mirror images."""
     others = tuple(view for i, view in enumerate(scene.train) if i != index)
     images = tuple(image for image in scene.mirrored if image.index != scene.train[index].index)
-    return Left(replace(scene, train=others, mirrored=images), scene.train[index], 0.0)
+    return Left(replace(scene, train=others, mirrored=images), scene.train[index])
 
 
 def spread_views(scene: Scene, count: int) -> list[int]:

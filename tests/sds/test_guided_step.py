@@ -127,6 +127,16 @@ def test_steps_towards_a_prior_that_knows_the_answer_reach_it(policy) -> None:
     assert sum(distances[-5:]) < 0.25 * sum(distances[:5])
 
 
+def test_targets_of_another_version_are_refused() -> None:
+    guided = guide(toy(), replace(ALWAYS, policy="recon"))
+    guided.gradients(7, blobs(), SETTINGS)
+    tensors, meta = guided.state()
+    guided.restore(tensors, meta)
+    old = {name: value[1] if name.startswith("target.") else value for name, value in tensors.items()}
+    with pytest.raises(ValueError, match="another version"):
+        guided.restore(old, meta)
+
+
 def test_empty_surroundings_do_not_weaken_a_target() -> None:
     """The same subject in a picture twice as wide is pulled alike: what is certain a quarter as hard as told, what is
     beside the subject not at all."""

@@ -149,6 +149,14 @@ def test_the_guard_asks_a_view_conditioned_prior_about_left_out_views(
     assert (guided > 0) == (factor > 0)
 
 
+def test_with_one_input_view_no_one_can_say_whether_a_view_conditioned_prior_helps(
+    dataset: Path, tmp_path: Path, prior: PixelPrior
+) -> None:
+    one = config(dataset, guard_views=2)
+    train(replace(one, data=replace(one.data, views=1)), tmp_path / "run")
+    assert guard_of(tmp_path / "run")["factor"] == 0
+
+
 def test_a_prior_that_fails_the_guard_by_failing_is_off(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
     prior.answer = lambda x_t, a, c: torch.full_like(x_t, float("nan"))
     train(config(dataset, guard_views=1, guard_steps=20), tmp_path / "run")
