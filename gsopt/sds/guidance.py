@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsopt.cameras import Cameras
 from gsopt.data.scene import Scene, View
-from gsopt.errors import NumericalError
+from gsopt.errors import InputError, NumericalError
 from gsopt.gaussians import Gaussians
 from gsopt.guidance_config import GuidanceConfig, settled, sure
 from gsopt.metrics import psnr
@@ -339,10 +339,10 @@ class Guide:
         return tensors, meta
 
     def restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-        """Inverse of `state`. ValueError for targets of another version."""
+        """Inverse of `state`. InputError for targets of another version."""
         targets = {int(k.removeprefix("target.")): v for k, v in tensors.items() if k.startswith("target.")}
         if any(target.shape[:-2] != (2, 3) for target in targets.values()):
-            raise ValueError("targets of the guidance that another version of gsopt made")
+            raise InputError("The checkpoint's guidance is of another version of gsopt. Start in another folder.")
         self.counts = Counts(**{item.name: meta["counts"][item.name] for item in fields(Counts)})
         self.memory = Memory(
             coverage=tensors.get("coverage"),

@@ -12,6 +12,7 @@ from priors import PixelPrior, gaussian_posterior, knows
 
 from gsopt.cameras import Cameras, intrinsics, look_at
 from gsopt.data.scene import Scene
+from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.guidance_config import GuidanceConfig
 from gsopt.llm_prompts.schema import Prompt
@@ -133,7 +134,7 @@ def test_targets_of_another_version_are_refused() -> None:
     tensors, meta = guided.state()
     guided.restore(tensors, meta)
     old = {name: value[1] if name.startswith("target.") else value for name, value in tensors.items()}
-    with pytest.raises(ValueError, match="another version"):
+    with pytest.raises(InputError, match="another version"):
         guided.restore(old, meta)
 
 
