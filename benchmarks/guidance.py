@@ -22,21 +22,14 @@ from gsopt.benchmark.machine import machine
 from gsopt.cli import main as gsopt
 from gsopt.events import to_json, write_atomic
 
+UNGUARDED = ["--guidance.guard-views", "0"]
+SDS = ["--guidance.policy", "sds", *UNGUARDED]
 ARMS: dict[str, list[str]] = {
     "off": ["--lambda-sds", "0"],
     "default": [],
-    "recon": ["--guidance.policy", "recon", "--guidance.guard-views", "0"],
-    "sds": ["--guidance.policy", "sds", "--guidance.guard-views", "0"],
-    "sds, words": [
-        "--guidance.policy",
-        "sds",
-        "--guidance.guard-views",
-        "0",
-        "--guidance.references",
-        "0",
-        "--guidance.image-weight",
-        "0",
-    ],
+    "recon": ["--guidance.policy", "recon", *UNGUARDED],
+    "sds": SDS,
+    "sds, words": [*SDS, "--guidance.references", "0", "--guidance.image-weight", "0"],
 }
 """All but `default` without the guard. `words`: no input view is shown, but the object's name is told."""
 METRICS = ("psnr", "ssim", "lpips_alex")

@@ -9,8 +9,7 @@ prior would be asked for a camera's image, the emulated one answers with
     (1)  y = r0 + s (y* - r0)
 
 r0 drawn from `off` and y* from `truth`. So it repairs what separates `off` from `truth` by -20 log10(1 - s) dB in every
-view, consistently: the most that a prior of that strength can do. `measured` records by how much a real one repairs the
-renders of `off` from the held-out cameras in one step. Runs that have a record are not made again.
+view, consistently: the most that a prior of that strength can do. Runs that have a record are not made again.
 """
 
 from __future__ import annotations
@@ -32,17 +31,11 @@ from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.machine import machine
 from gsopt.cameras import Cameras
 from gsopt.cli import main as gsopt
-from gsopt.data.scene import load_scene
 from gsopt.events import to_json, write_atomic
-from gsopt.finetune.fits import look
-from gsopt.finetune.measure import measure
-from gsopt.guidance_config import GuidanceConfig
 from gsopt.render import FinishedRun, open_run
 from gsopt.sds.noise import Latents
-from gsopt.sds.opening import open_prior
 from gsopt.sds.prior import Condition, Encoder, Images
-from gsopt.sds.view_prior import ViewPrior, cosine_schedule
-from gsopt.training.mirrors import with_mirrors
+from gsopt.sds.view_prior import cosine_schedule
 
 PAGE = Path(__file__).parents[1] / "docs" / "howto" / "guidance.md"
 RESULT = Path(__file__).parent / "results" / "prior_strength.json"
@@ -118,15 +111,6 @@ def train(scene: Path, folder: Path, flags: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def measured(off: FinishedRun, size: int = SIZE) -> dict[str, Any]:
-    """How a real prior, the embedded one, repairs what `off` shows to the held-out cameras; mean PSNR, dB."""
-    scene = with_mirrors(off.config, load_scene(off.config.data))
-    prior = open_prior("embedded", GuidanceConfig())
-    assert isinstance(prior, ViewPrior)
-    found = measure(prior.unet, look(off.gaussians, scene, scene.test, size, off.backend))
-    return {"render": found["render"], "repair": found["repair"]}
-
-
 def make(scene: Path, views: int, seed: int, arms: Sequence[str], runs: Path, known: dict[str, Any]) -> None:
     """The runs of one scene that `known` lacks, by arm, into it."""
     folder = runs / f"{scene.name}_{views}_{seed}"
@@ -137,7 +121,6 @@ def make(scene: Path, views: int, seed: int, arms: Sequence[str], runs: Path, kn
         )
     if "off" not in known or not (folder / "off" / "splat.ply").exists():
         known["off"] = train(scene, folder / "off", [*few, *ARMS["off"][1]])
-        known["measured"] = measured(open_run(folder / "off", threads=1))
     truth, off = (open_run(folder / name, threads=1) for name in ("truth", "off"))
     for arm in arms:
         repair, flags = ARMS[arm]

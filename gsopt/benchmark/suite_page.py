@@ -148,15 +148,16 @@ def time_row(runs: Sequence[Run], a: Way, base: Way) -> list[str]:
 
 
 def scene_rows(runs: Sequence[Run], scenes: Sequence[str], ways: Sequence[Way]) -> Table:
-    """One row per scene; seeds averaged; what the guard left of the guidance."""
+    """One row per scene; the seeds that its arms share averaged; what the guard left of the guidance."""
     rows = []
     for scene in scenes:
         row = [scene.rpartition("/")[2]]
+        here = [run for run in runs if run["scene"] == scene]
+        here = suite_stats.common(here, [one for one in ways if any(way(run) == one for run in here)]) or here
         for one in ways:
-            mine = [run for run in runs if way(run) == one and run["scene"] == scene]
-            value = suite_stats.by_scene(mine, "psnr").get(scene)
+            value = suite_stats.by_scene([run for run in here if way(run) == one], "psnr").get(scene)
             row.append("" if value is None else f"{value:.2f}")
-        factors = [run["guidance"]["factor"] for run in runs if run["scene"] == scene]
+        factors = [run["guidance"]["factor"] for run in here]
         rows.append([*row, ", ".join(f"{factor:g}" for factor in factors if factor is not None)])
     return ["scene", *(_name(one) for one in ways), "guard's factor"], rows
 

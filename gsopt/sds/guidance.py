@@ -164,7 +164,6 @@ class Guide:
 
     def _guided(self, step: int, index: int, gaussians: Gaussians, settings: RasterSettings) -> Gradients:
         """Render, ask, and carry the answer back to the parameters."""
-        assert self.memory.coverage is not None
         # recon compares with a target of an earlier step: neither camera nor background may have changed since.
         still = self.config.policy == "recon"
         camera = self.rig.camera(index, None if still else self._random(step, index, "jitter"))

@@ -295,6 +295,22 @@ def test_arms_are_averaged_over_what_all_of_them_have(tmp_path: Path) -> None:
     assert "| 3dgs, 2,000 | 1 | 20.00 |" in text
 
 
+def test_rows_of_scenes_are_of_the_seeds_that_all_arms_have(tmp_path: Path) -> None:
+    """Else two arms of the same bits would seem to differ, because one of them has a second seed."""
+    page = page_of(
+        document(
+            *(
+                record(arm, 20.0, scene)
+                for arm in ("ours-0", "ours")
+                for scene in ("objects/oakChair", "objects/teapot")
+            ),
+            record("ours-0", 30.0, "objects/oakChair", seed=1),
+        ),
+        tmp_path,
+    )
+    assert "| oakChair | 20.00 | 20.00 | 0.5 |" in page
+
+
 def test_a_page_says_why_an_arm_was_left_out_and_that_versions_differ(tmp_path: Path) -> None:
     named = {name: record("ours-user", 20)[name] for name in suite_file.ID}
     made = suite_file.with_skip(
