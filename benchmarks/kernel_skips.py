@@ -72,11 +72,12 @@ class State:
 
     def iterate(self, target: Target) -> tuple[torch.Tensor, Gradients]:
         """A full iteration whose rates are so small that the state stays what it is."""
-        frame = self.backend.forward(self.model.gaussians, target.camera, RasterSettings(), torch.ones(3))
+        settings = RasterSettings()
+        frame = self.backend.forward(self.model.gaussians, target.camera, settings, torch.ones(3))
         loss = self.backend.photometric(frame.colors, target.colors, 0.2)
-        self.spent = self.backend.backward(frame, loss.v_colors, into=self.spent)
+        self.spent = self.backend.backward(frame, loss.v_colors, bands=False, into=self.spent)
         rates = dict.fromkeys(learning_rates(OptimizerConfig(), 0.0), 0.0)
-        adam_step(self.model, self.spent, rates, OptimizerConfig(), self.backend, sh_degree=3)
+        adam_step(self.model, self.spent, rates, OptimizerConfig(), self.backend, target.camera, settings)
         return frame.colors, self.spent
 
 

@@ -85,8 +85,8 @@ class Iteration:
         """One full iteration."""
         frame = self.backend.forward(self.model.gaussians, self.camera, self.settings)
         loss = self.backend.photometric(frame.colors, self.target, LAMBDA_DSSIM)
-        self.spent = self.backend.backward(frame, loss.v_colors, into=self.spent)
-        adam_step(self.model, self.spent, self.rates, self.config, self.backend, sh_degree=3)
+        self.spent = self.backend.backward(frame, loss.v_colors, bands=False, into=self.spent)
+        adam_step(self.model, self.spent, self.rates, self.config, self.backend, self.camera, self.settings)
 
     def render(self) -> None:
         """The picture alone."""

@@ -82,8 +82,8 @@ class Gradients:
     log_scales: Float[Tensor, "N 3"]
     logit_opacities: Float[Tensor, "N"]
     sh0: Float[Tensor, "N 1 3"]
-    shN: Float[Tensor, "N K-1 3"]
-    """Rows of bands above the rendered sh_degree are zero."""
+    shN: Float[Tensor, "N K-1 3"] | None
+    """Rows of bands above the rendered sh_degree are zero. None when `backward` was told to leave it out."""
     means2d: Float[Tensor, "N 2"]
     """dLoss/d(mean2d), 1/px: signed sum over pixels."""
     means2d_abs: Float[Tensor, "N 2"] | None
@@ -99,6 +99,19 @@ class Photometric:
     loss: float
     v_colors: Float[Tensor, "H W 3"]
     """dLoss/d(rendered)."""
+
+
+@dataclass(frozen=True)
+class AdamStep:
+    """The numbers of one Adam step (Kingma & Ba 2015)."""
+
+    lr: dict[str, float]
+    """Rate of every parameter that takes the step."""
+    steps: dict[str, int]
+    """Its number, counted from 1."""
+    beta1: float
+    beta2: float
+    eps: float
 
 
 class Backend(Protocol):
@@ -126,10 +139,13 @@ class Backend(Protocol):
         v_depths: Float[Tensor, "H W"] | None = None,
         *,
         absgrad: bool = False,
+        bands: bool = True,
         into: Gradients | None = None,
     ) -> Gradients:
         """Gradients of the parameters that `forward` drew. A frame can be used once.
 
+        `bands`: whether to write down the gradient of shN, three quarters of all numbers. Where no other gradient is
+        added to it `adam` does without.
         `into`: gradients that nobody needs any more; a backend may overwrite and return them, which spares it fresh
         memory. They serve only while the number of Gaussians stays the same.
         """
@@ -143,16 +159,17 @@ class Backend(Protocol):
 
     def adam(
         self,
-        param: Tensor,
-        grad: Tensor,
-        exp_avg: Tensor,
-        exp_avg_sq: Tensor,
-        *,
-        lr: float,
-        beta1: float,
-        beta2: float,
-        eps: float,
-        step: int,
+        gaussians: Gaussians,
+        gradients: Gradients,
+        exp_avg: Gaussians,
+        exp_avg_sq: Gaussians,
+        step: AdamStep,
+        camera: Cameras,
+        settings: RasterSettings,
     ) -> None:
-        """One Adam step in place (Kingma & Ba 2015), `step` counted from 1. All tensors [N, ...], same shape."""
+        """One Adam step in place, for gradients of a frame that `camera` drew with `settings`.
+
+        Where `gradients.shN` was left out they must be of that frame alone: it is the outer product
+        Y(direction of view) ⊗ gradients.sh0 / Y_0 then.
+        """
         ...

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -14,9 +16,10 @@ from gsopt.cameras import Cameras
 from gsopt.errors import NumericalError, UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
-from gsopt.raster.backend import Frame, Gradients, Photometric, RasterSettings
+from gsopt.raster.backend import AdamStep, Frame, Gradients, Photometric, RasterSettings
 
 ISA_VARIABLE = "GSOPT_ISA"
+GRADIENTS = tuple(field.name for field in fields(Gradients))
 
 
 def workspace(threads: int = 0) -> Any:
@@ -50,6 +53,7 @@ class CpuBackend:
 
     def __init__(self, threads: int = 0) -> None:
         self._workspace = workspace(threads)
+        self._handles = _Handles()
         self._idle: list[Any] = []  # frames whose buffers can be used again
 
     @property
@@ -73,17 +77,8 @@ class CpuBackend:
         """See `Backend.forward`."""
         height, width, n = camera.height, camera.width, len(gaussians)
         gaussians = _as_float32(gaussians)
-        model = _cpu.Model(*(getattr(gaussians, name) for name in PARAMETERS))
-        view = _cpu.Camera(
-            camera.viewmats[0].double().flatten().tolist(),
-            camera.Ks[0].double().flatten().tolist(),
-            width,
-            height,
-            settings.near_plane,
-            settings.far_plane,
-            settings.eps2d,
-            settings.antialiased,
-        )
+        model = self._handles.model(gaussians)
+        view = self._handles.view(camera, settings)
         frame = self._idle.pop() if self._idle else _cpu.Frame()
         colors, alphas = torch.empty(height, width, 3), torch.empty(height, width)
         depths = torch.empty(height, width) if depth else None
@@ -107,14 +102,15 @@ class CpuBackend:
         v_depths: Float[Tensor, "H W"] | None = None,
         *,
         absgrad: bool = False,
+        bands: bool = True,
         into: Gradients | None = None,
     ) -> Gradients:
         """See `Backend.backward`. The frame's buffers are used again by a later `forward`."""
         context = frame.context
         assert isinstance(context, _Context)
         buffers = context.take()
-        gradients = _overwritable(context.gaussians, absgrad, into)
-        out = _cpu.Gradient(*(getattr(gradients, field.name) for field in fields(Gradients)))
+        gradients = _overwritable(context.gaussians, absgrad, bands, into)
+        out = self._handles.gradient(gradients)
         alphas, depths = _contiguous(v_alphas), _contiguous(v_depths)
         _cpu.backward(self._workspace, buffers, context.model, _contiguous(v_colors), alphas, depths, out)
         self._idle.append(buffers)
@@ -138,32 +134,78 @@ class CpuBackend:
 
     def adam(
         self,
-        param: Tensor,
-        grad: Tensor,
-        exp_avg: Tensor,
-        exp_avg_sq: Tensor,
-        *,
-        lr: float,
-        beta1: float,
-        beta2: float,
-        eps: float,
-        step: int,
+        gaussians: Gaussians,
+        gradients: Gradients,
+        exp_avg: Gaussians,
+        exp_avg_sq: Gaussians,
+        step: AdamStep,
+        camera: Cameras,
+        settings: RasterSettings,
     ) -> None:
-        """See `Backend.adam`."""
-        active = param[0].numel() if len(param) else 0
-        _cpu.adam(self._workspace, param, grad, exp_avg, exp_avg_sq, len(param), active, lr, beta1, beta2, eps, step)
+        """See `Backend.adam`. All tensors must be float32 and contiguous."""
+        model, m, v = (self._handles.model(record) for record in (gaussians, exp_avg, exp_avg_sq))
+        out = self._handles.gradient(gradients)
+        rates = [step.lr.get(name, 0.0) for name in PARAMETERS]
+        steps = [step.steps[name] if name in step.lr else 0 for name in PARAMETERS]
+        view, degree = self._handles.view(camera, settings), min(settings.sh_degree, gaussians.sh_degree)
+        _cpu.adam(self._workspace, model, out, m, v, rates, steps, step.beta1, step.beta2, step.eps, view, degree)
 
 
-def _overwritable(gaussians: Gaussians, absgrad: bool, spent: Gradients | None) -> Gradients:
+class _Handles:
+    """What the kernels make of a record, kept as long as that record: each takes microseconds for every tensor."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, Any] = {}
+
+    def model(self, record: Gaussians) -> Any:
+        """Views of the tensors, which must be float32 and contiguous."""
+        return self._of(record, lambda: _cpu.Model(*(getattr(record, name) for name in PARAMETERS)))
+
+    def gradient(self, record: Gradients) -> Any:
+        """Views of the tensors, which must be float32 and contiguous."""
+        return self._of(record, lambda: _cpu.Gradient(*(getattr(record, name) for name in GRADIENTS)))
+
+    def view(self, camera: Cameras, settings: RasterSettings) -> Any:
+        """A copy of the one camera of `camera`, made again when that was changed in place."""
+        drawn_by = settings.near_plane, settings.far_plane, settings.eps2d, settings.antialiased
+        key = camera.viewmats._version, camera.Ks._version, drawn_by
+        views = self._of(camera, dict)
+        if key not in views:
+            views.clear()
+            viewmat, K = camera.viewmats[0].flatten().tolist(), camera.Ks[0].flatten().tolist()
+            views[key] = _cpu.Camera(viewmat, K, camera.width, camera.height, *drawn_by)
+        return views[key]
+
+    def _of(self, record: Any, make: Callable[[], Any]) -> Any:
+        key = id(record)
+        if key not in self._known:
+            self._known[key] = make()
+            weakref.finalize(record, self._known.pop, key)
+        return self._known[key]
+
+
+def _overwritable(gaussians: Gaussians, absgrad: bool, bands: bool, spent: Gradients | None) -> Gradients:
     """`spent` where its tensors fit, else uninitialised ones."""
-    if spent is not None and spent.shN.shape == gaussians.shN.shape and (spent.means2d_abs is None) != absgrad:
+    if (
+        spent is not None
+        and spent.means.shape == gaussians.means.shape
+        and (spent.means2d_abs is not None) == absgrad
+        and (spent.shN is not None and spent.shN.shape == gaussians.shN.shape if bands else spent.shN is None)
+    ):
         return spent
     n = len(gaussians)
-    empty = {name: torch.empty_like(tensor) for name, tensor in gaussians.items()}
-    return Gradients(**empty, means2d=torch.empty(n, 2), means2d_abs=torch.empty(n, 2) if absgrad else None)
+    empty: dict[str, Any] = {
+        name: torch.empty_like(tensor) for name, tensor in gaussians.items() if bands or name != "shN"
+    }
+    return Gradients(
+        **{"shN": None, **empty}, means2d=torch.empty(n, 2), means2d_abs=torch.empty(n, 2) if absgrad else None
+    )
 
 
 def _as_float32(gaussians: Gaussians) -> Gaussians:
+    """The same record where that is what it holds."""
+    if all(t.dtype == torch.float32 and t.is_contiguous() and not t.requires_grad for _, t in gaussians.items()):
+        return gaussians
     return Gaussians(**{name: tensor.detach().float().contiguous() for name, tensor in gaussians.items()})
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -25,6 +26,7 @@ from gsopt.raster.backend import (
     ALPHA_MIN,
     DET_MIN,
     TRANSMITTANCE_MIN,
+    AdamStep,
     Frame,
     Gradients,
     Photometric,
@@ -246,6 +248,7 @@ class ReferenceBackend:
         v_depths: Float[Tensor, "H W"] | None = None,
         *,
         absgrad: bool = False,
+        bands: bool = True,
         into: Gradients | None = None,
     ) -> Gradients:
         """Vector-Jacobian product by autograd; `into` is left alone."""
@@ -262,7 +265,9 @@ class ReferenceBackend:
         inputs = [*(tensor for _, tensor in tape.leaves.items()), tape.offsets2d]
         image = (tape.colors, tape.alphas, tape.depths)
         *parameters, means2d = torch.autograd.grad(image, inputs, v, allow_unused=True, materialize_grads=True)
-        named = dict(zip(PARAMETERS, parameters, strict=True))
+        named: dict[str, Any] = dict(zip(PARAMETERS, parameters, strict=True))
+        if not bands:
+            named["shN"] = None
         return Gradients(**named, means2d=means2d, means2d_abs=means2d_abs)
 
     def photometric(
@@ -278,23 +283,26 @@ class ReferenceBackend:
     @torch.no_grad()
     def adam(
         self,
-        param: Tensor,
-        grad: Tensor,
-        exp_avg: Tensor,
-        exp_avg_sq: Tensor,
-        *,
-        lr: float,
-        beta1: float,
-        beta2: float,
-        eps: float,
-        step: int,
+        gaussians: Gaussians,
+        gradients: Gradients,
+        exp_avg: Gaussians,
+        exp_avg_sq: Gaussians,
+        step: AdamStep,
+        camera: Cameras,
+        settings: RasterSettings,
     ) -> None:
         """One Adam step in place (Kingma & Ba 2015, algorithm 1)."""
-        exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
-        exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        m_hat = exp_avg / (1 - beta1**step)
-        v_hat = exp_avg_sq / (1 - beta2**step)
-        param.sub_(lr * m_hat / (v_hat.sqrt() + eps))
+        grads = {name: getattr(gradients, name) for name in step.lr}
+        if "shN" in grads and grads["shN"] is None:
+            degree = min(settings.sh_degree, gaussians.sh_degree)
+            grads["shN"] = _bands_gradient(gaussians, gradients.sh0, camera, degree)
+        for name, grad in grads.items():
+            m, v = getattr(exp_avg, name), getattr(exp_avg_sq, name)
+            m.mul_(step.beta1).add_(grad, alpha=1 - step.beta1)
+            v.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
+            m_hat = m / (1 - step.beta1 ** step.steps[name])
+            v_hat = v / (1 - step.beta2 ** step.steps[name])
+            getattr(gaussians, name).sub_(step.lr[name] * m_hat / (v_hat.sqrt() + step.eps))
 
     def _image(
         self, splats: Splats, background: Float[Tensor, "3"], camera: Cameras
@@ -347,3 +355,13 @@ def _pixel_chunks(splats: Splats, height: int, width: int) -> Iterator[Float[Ten
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     centers = (torch.stack([x, y], dim=-1).view(-1, 2) + 0.5).to(splats.means2d)
     yield from centers.split(max(1, PAIRS_PER_CHUNK // max(1, len(splats.rows))))
+
+
+def _bands_gradient(
+    gaussians: Gaussians, v_sh0: Float[Tensor, "N 1 3"], camera: Cameras, sh_degree: int
+) -> Float[Tensor, "N K-1 3"]:
+    """Gradient of shN from that of sh0: a color is linear in both."""
+    directions = torch.nn.functional.normalize(gaussians.means - camera.centers[0].to(gaussians.means), dim=-1)
+    drawn = sh.basis(directions, sh_degree)[:, 1:, None] * v_sh0 / sh.C0
+    rest = gaussians.shN.shape[1] - drawn.shape[1]
+    return torch.nn.functional.pad(drawn, (0, 0, 0, rest))

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsopt.cameras import Cameras
 from gsopt.config import OptimizerConfig
 from gsopt.gaussians import PARAMETERS, Gaussians
-from gsopt.raster.backend import Backend, Gradients
+from gsopt.raster.backend import AdamStep, Backend, Gradients, RasterSettings
 
 
 @dataclass(frozen=True)
@@ -75,25 +76,15 @@ def adam_step(
     rates: dict[str, float],
     config: OptimizerConfig,
     backend: Backend,
-    *,
-    sh_degree: int,
+    camera: Cameras,
+    settings: RasterSettings,
 ) -> None:
-    """One Adam step of every parameter, in place.
+    """One Adam step of every parameter, in place, for gradients of a frame that `camera` drew with `settings`.
 
     While only band 0 is drawn shN has no gradient and is left out: 45 of a Gaussian's 59 numbers.
     """
-    for name, param in model.gaussians.items():
-        if param.numel() == 0 or (name == "shN" and sh_degree == 0):
-            continue
+    lr = {name: rate for name, rate in rates.items() if name != "shN" or settings.sh_degree > 0}
+    for name in lr:
         model.steps[name] += 1
-        backend.adam(
-            param,
-            getattr(gradients, name),
-            getattr(model.exp_avg, name),
-            getattr(model.exp_avg_sq, name),
-            lr=rates[name],
-            beta1=config.beta1,
-            beta2=config.beta2,
-            eps=config.eps,
-            step=model.steps[name],
-        )
+    step = AdamStep(lr, model.steps, config.beta1, config.beta2, config.eps)
+    backend.adam(model.gaussians, gradients, model.exp_avg, model.exp_avg_sq, step, camera, settings)

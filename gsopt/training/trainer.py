@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsopt.cameras import Cameras
 from gsopt.config import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
@@ -123,7 +124,7 @@ class Trainer:
             self.poses.update(index, self.step, self.model.gaussians, gradients, settings.sh_degree)
         if self._guidance is not None:
             self._guidance.add(self.step, self.model.gaussians, settings, gradients)
-        self._update(gradients, settings.sh_degree)
+        self._update(gradients, target.camera, settings)
         self._change_set()
         self._resting.note(index, loss)
         self._end_when_flat(loss)
@@ -167,7 +168,8 @@ class Trainer:
             v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha * target.share)
         weight = target.share * target.color
         v_colors = photometric.v_colors if weight == 1 else photometric.v_colors.mul_(weight)
-        gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=self._wants_absgrad(), into=self._spent)
+        absgrad, bands = self._wants_absgrad(), self._guidance is not None  # which adds its own to them
+        gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=absgrad, bands=bands, into=self._spent)
         self._spent = gradients
         self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])
         if self.config.schedule.bands == "residual" and self._bands.watches(self.step):
@@ -199,13 +201,13 @@ class Trainer:
             add_scale_gradient(gradients.log_scales, gaussians.log_scales, self._weights.scale)
         return gradients
 
-    def _update(self, gradients: Gradients, sh_degree: int) -> None:
+    def _update(self, gradients: Gradients, camera: Cameras, settings: RasterSettings) -> None:
         """Adam, then what density control adds to a step."""
         config = self.config.optimizer
         share = schedule.lr_share(self.step, self._last, self._settling, config)
         lr_means = share * schedule.lr_means(self.step, self.config.iterations, config, self._extent)
         rates = learning_rates(config, lr_means, share)
-        adam_step(self.model, gradients, rates, config, self.backend, sh_degree=sh_degree)
+        adam_step(self.model, gradients, rates, config, self.backend, camera, settings)
         self._density.after_step(self.model, lr_means)
 
     def _change_set(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
 
 import pytest
 import torch
@@ -24,10 +23,10 @@ from tolerances import (
 from torch import Tensor
 
 from gsopt.errors import UsageError
-from gsopt.gaussians import PARAMETERS
+from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.api import make_backend
-from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
+from gsopt.raster.backend import AdamStep, Backend, Frame, Gradients, RasterSettings
 from gsopt.raster.cpu_backend import ISA_VARIABLE, CpuBackend
 from gsopt.raster.reference import ReferenceBackend, extents, project
 
@@ -210,21 +209,88 @@ def test_equal_images_have_no_loss(backend: Backend) -> None:
     assert float(got.v_colors.abs().max()) * target.numel() <= SSIM_GRADIENT
 
 
-@pytest.mark.parametrize("shape", [(5,), (7, 3), (3, 15, 3), (0, 3), (1000, 4)])
-def test_adam(backend: Backend, shape: tuple[int, ...]) -> None:
-    rng = torch.Generator().manual_seed(0)
-    tensors = [torch.randn(shape, generator=rng) for _ in range(2)]
-    mine = [tensors[0].clone(), torch.zeros(shape), torch.zeros(shape)]
-    truth = [tensor.double() for tensor in mine]
+def random_like(record: Gaussians, rng: torch.Generator, scale: float = 1.0) -> Gaussians:
+    return Gaussians(**{name: scale * torch.randn(tensor.shape, generator=rng) for name, tensor in record.items()})
+
+
+def adam_step(step: int, names: tuple[str, ...] = PARAMETERS) -> AdamStep:
+    return AdamStep(dict.fromkeys(names, 1e-2), dict.fromkeys(PARAMETERS, step), 0.9, 0.999, 1e-15)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 333])
+def test_adam(backend: Backend, count: int) -> None:
+    case, rng = single(make_case(1, count=count)), torch.Generator().manual_seed(0)
+    start = random_like(case.gaussians, rng)
+    mine = [start, *(random_like(start, rng, 0.0) for _ in range(2))]
+    truth = [record.to(torch.float64) for record in mine]
     for step in (1, 2, 3):
-        grad = torch.randn(shape, generator=rng) * 10.0 ** (-3 * step)
-        before = truth[0].clone()
-        options: dict[str, Any] = {"lr": 1e-2, "beta1": 0.9, "beta2": 0.999, "eps": 1e-15, "step": step}
-        backend.adam(mine[0], grad, mine[1], mine[2], **options)
-        ORACLE.adam(truth[0], grad.double(), truth[1], truth[2], **options)
-        scale = max(1.0, float((truth[0] - before).abs().sum()), float(before.abs().sum()))
+        grads = random_like(start, rng, 10.0 ** (-3 * step))
+        gradients = Gradients(**dict(grads.items()), means2d=torch.zeros(count, 2), means2d_abs=None)
+        exact = Gradients(**dict(grads.to(torch.float64).items()), means2d=torch.zeros(count, 2), means2d_abs=None)
+        names = PARAMETERS[: 4 + step]  # the last ones wait
+        before = [tensor.clone() for _, tensor in truth[0].items()]
+        backend.adam(mine[0], gradients, mine[1], mine[2], adam_step(step, names), case.camera, case.settings)
+        ORACLE.adam(truth[0], exact, truth[1], truth[2], adam_step(step, names), case.camera, case.settings)
         for got, expected in zip(mine, truth, strict=True):
-            assert float((got - expected).abs().sum()) <= ADAM * scale
+            for name, old in zip(PARAMETERS, before, strict=True):
+                moved = (getattr(truth[0], name) - old).abs().sum()
+                scale = max(1.0, float(moved), float(old.abs().sum()))
+                error = (getattr(got, name) - getattr(expected, name)).abs().sum()
+                assert float(error) <= ADAM * scale, (name, step)
+
+
+@pytest.mark.parametrize("isa", _cpu.instruction_sets())
+@pytest.mark.parametrize(("stored", "drawn_degree"), [(3, 3), (3, 1), (2, 2), (1, 3)])
+def test_adam_needs_no_gradient_of_the_bands(
+    isa: str, stored: int, drawn_degree: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The step that finds it from that of sh0 is the one that is given it, and moves nothing that is not drawn."""
+    monkeypatch.setenv(ISA_VARIABLE, isa)
+    settings = RasterSettings(sh_degree=drawn_degree)
+    case = single(make_case(6, count=77, width=40, height=36, settings=settings, sh_degree=stored))
+    weights = weights_like(case)
+    ends: dict[tuple[str, bool], list[Gaussians]] = {}
+    for name in ("cpu", "reference"):
+        for bands in (True, False):
+            backend = built(name)
+            gradients = backend.backward(draw(backend, case), *(w.float() for w in weights), bands=bands)
+            assert (gradients.shN is not None) == bands
+            records = [case.gaussians.to(torch.float32).select(torch.arange(77))]
+            records += [random_like(records[0], torch.Generator().manual_seed(0), 0.0) for _ in range(2)]
+            backend.adam(records[0], gradients, records[1], records[2], adam_step(1), case.camera, settings)
+            ends[name, bands] = records
+    for name in ("cpu", "reference"):
+        for got, expected in zip(ends[name, False], ends[name, True], strict=True):
+            for field, tensor in got.items():
+                torch.testing.assert_close(tensor, getattr(expected, field), rtol=1e-5, atol=1e-7, msg=field)
+    moments = ends["cpu", False][1].shN
+    drawn_rows = (min(stored, drawn_degree) + 1) ** 2 - 1
+    assert bool((moments[:, :drawn_rows] != 0).any())
+    assert not bool(moments[:, drawn_rows:].any())
+
+
+def test_what_is_changed_in_place_is_drawn_anew() -> None:
+    """The kernels' views of tensors and cameras are kept between frames."""
+    case, backend = single(make_case(3, count=30)), CpuBackend(1)
+    first = draw(backend, case)
+    case.gaussians.means.add_(0.25)
+    moved = draw(backend, case)
+    torch.testing.assert_close(moved.colors, draw(CpuBackend(1), case).colors, rtol=0, atol=0)
+    assert not torch.equal(first.colors, moved.colors)
+    case.camera.viewmats[0, 0, 3] += 0.5
+    panned = draw(backend, case)
+    torch.testing.assert_close(panned.colors, draw(CpuBackend(1), case).colors, rtol=0, atol=0)
+    assert not torch.equal(moved.colors, panned.colors)
+
+
+def test_a_step_of_what_is_not_contiguous_is_refused() -> None:
+    """A copy would be stepped instead."""
+    case, backend = single(make_case(3, count=30)), CpuBackend(1)
+    gradients = backend.backward(draw(backend, case), *(w.float() for w in weights_like(case)))
+    turned = replace(case.gaussians, means=case.gaussians.means.T.contiguous().T)
+    moments = [random_like(turned, torch.Generator(), 0.0) for _ in range(2)]
+    with pytest.raises(TypeError):
+        backend.adam(turned, gradients, *moments, adam_step(1), case.camera, case.settings)
 
 
 @pytest.mark.parametrize("isa", _cpu.instruction_sets())

@@ -171,17 +171,3 @@ def test_the_photometric_gradient_is_the_central_difference() -> None:
             losses.append(SMOOTH.photometric(moved, target, 0.2).loss)
         difference = (losses[0] - losses[1]) / (2 * DIFFERENCE_STEP)
         assert float(result.v_colors.view(-1)[index]) == pytest.approx(difference, abs=1e-9)
-
-
-def test_adam_takes_the_steps_of_torch() -> None:
-    rng = torch.Generator().manual_seed(0)
-    param = torch.randn(4, 3, generator=rng, dtype=torch.float64)
-    twin = param.clone().requires_grad_()
-    optimizer = torch.optim.Adam([twin], lr=1e-2, betas=(0.8, 0.99), eps=1e-15)
-    m, v = torch.zeros_like(param), torch.zeros_like(param)
-    for step in range(1, 6):
-        grad = torch.randn(4, 3, generator=rng, dtype=torch.float64)
-        twin.grad = grad.clone()
-        optimizer.step()
-        SMOOTH.adam(param, grad, m, v, lr=1e-2, beta1=0.8, beta2=0.99, eps=1e-15, step=step)
-    torch.testing.assert_close(param, twin.detach(), atol=EXACT, rtol=0)

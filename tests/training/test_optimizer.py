@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_scenes import cloud
+from tiny_scenes import cloud, ring
 
 from gsopt.config import OptimizerConfig
 from gsopt.gaussians import PARAMETERS
 from gsopt.raster.api import make_backend
-from gsopt.raster.backend import Gradients
+from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 
 CONFIG = OptimizerConfig()
@@ -22,10 +22,15 @@ def random_gradients(model: Model, seed: int) -> Gradients:
     return Gradients(**grads, means2d=torch.zeros(len(model), 2), means2d_abs=None)
 
 
+def step(model: Model, seed: int, sh_degree: int) -> None:
+    camera, settings = ring(1, 0.0), RasterSettings(sh_degree=sh_degree)
+    adam_step(model, random_gradients(model, seed), RATES, CONFIG, make_backend("reference"), camera, settings)
+
+
 def stepped(steps: int, sh_degree: int = 1) -> Model:
     model = Model.start(cloud(12, seed=1))
     for seed in range(steps):
-        adam_step(model, random_gradients(model, seed), RATES, CONFIG, make_backend("reference"), sh_degree=sh_degree)
+        step(model, seed, sh_degree)
     return model
 
 
@@ -49,7 +54,7 @@ def test_the_steps_are_those_of_torch() -> None:
 def test_the_callers_gaussians_are_left_alone() -> None:
     start = cloud(12, seed=1)
     model = Model.start(start)
-    adam_step(model, random_gradients(model, 0), RATES, CONFIG, make_backend("reference"), sh_degree=1)
+    step(model, 0, 1)
     assert not torch.equal(model.gaussians.means, start.means)
     torch.testing.assert_close(start.means, cloud(12, seed=1).means, rtol=0, atol=0)
 

@@ -1,35 +1,60 @@
-// One Adam step in place (Kingma & Ba 2015). Rows whose tail is not in use yet (spherical harmonics above the degree
-// that is rendered) are left alone: their gradients and moments are zero, so the step would change nothing.
+// One Adam step in place (Kingma & Ba 2015), a thousand Gaussians at a time, all their numbers.
 #pragma once
 #include "frame.h"
 #include "parallel.h"
+#include "project.h"
 #include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
 
-inline void adam_span(const AdamArguments& a, int64_t begin, int64_t n) {
-  float *p = a.param + begin, *m = a.exp_avg + begin, *v = a.exp_avg_sq + begin;
-  const float* g = a.grad + begin;
+// n numbers of a parameter from `begin` on, and their gradient `g`.
+inline void adam_span(const AdamArguments& a, const AdamParameter& of, int64_t begin, int64_t n, const float* g) {
+  float *p = of.param + begin, *m = of.exp_avg + begin, *v = of.exp_avg_sq + begin;
   const float d1 = 1.f - a.beta1, d2 = 1.f - a.beta2;
   int64_t i = 0;
   for (; i + kWide <= n; i += kWide) {
     const wide grad = load_wide(g + i), mean = load_wide(m + i) * a.beta1 + grad * d1, square = load_wide(v + i) * a.beta2 + grad * grad * d2;
     store_wide(m + i, mean), store_wide(v + i, square);
-    store_wide(p + i, load_wide(p + i) - mean * a.step_size / (sqrt(square) * a.inv_sqrt_correction2 + a.eps));
+    store_wide(p + i, load_wide(p + i) - mean * of.step_size / (sqrt(square) * of.inv_sqrt_correction2 + a.eps));
   }
   for (; i < n; ++i) {
     m[i] = m[i] * a.beta1 + g[i] * d1;
     v[i] = v[i] * a.beta2 + g[i] * g[i] * d2;
-    p[i] -= m[i] * a.step_size / (__builtin_sqrtf(v[i]) * a.inv_sqrt_correction2 + a.eps);
+    p[i] -= m[i] * of.step_size / (__builtin_sqrtf(v[i]) * of.inv_sqrt_correction2 + a.eps);
   }
 }
 
+// shN of n <= kWide Gaussians from `first` on. The gradient of one frame is an outer product that no one wrote down:
+// dLoss/d(shN row) = Y(direction of view) ⊗ dLoss/d(sh0) / Y_0. `rows` has room for it and zeros where no band is drawn.
+inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t first, int n, float* rows) {
+  const int bands = (a.sh_degree + 1) * (a.sh_degree + 1) - 1;
+  alignas(64) float mean[3][kWide] = {}, Y[15][kWide];
+  for (int l = 0; l < n; ++l)
+    for (int k = 0; k < 3; ++k) mean[k][l] = a.means[3 * (first + l) + k];
+  wide inverse_distance, basis[15];
+  const Vec3<wide> at = {load_wide(mean[0]), load_wide(mean[1]), load_wide(mean[2])};
+  const Vec3<wide> d = view_directions(a.camera, at - splat3<wide>(a.camera.pivot), inverse_distance);
+  sh_basis(a.sh_degree, d.x, d.y, d.z, basis);
+  for (int k = 0; k < bands; ++k) store_wide(Y[k], basis[k]);
+  for (int l = 0; l < n; ++l) {
+    const float* v = a.v_sh0 + 3 * (first + l);
+    const f4 v_color = f4{v[0], v[1], v[2], 0.f} * (1.f / kSH0);
+    // The fourth lane is overwritten by the next coefficient.
+    for (int k = 0; k < bands; ++k) store4(rows + l * of.stride + 3 * k, v_color * Y[k][l]);
+  }
+  adam_span(a, of, first * of.stride, n * of.stride, rows);
+}
+
 inline void adam_stage(Pool& pool, const AdamArguments& a) {
-  constexpr int64_t kRows = 2048;
-  parallel(pool, divide_up(a.rows, kRows), [&](int chunk, int) {
-    const int64_t begin = chunk * kRows, end = begin + kRows < a.rows ? begin + kRows : a.rows;
-    if (a.active == a.stride) return adam_span(a, begin * a.stride, (end - begin) * a.stride);
-    for (int64_t row = begin; row < end; ++row) adam_span(a, row * a.stride, a.active);
+  const int64_t fair = a.count / (4 * pool.threads()), kRows = fair < 256 ? 256 : (fair > 16384 ? 16384 : fair);
+  parallel(pool, divide_up(a.count, kRows), [&](int chunk, int) {
+    const int64_t begin = chunk * kRows, end = begin + kRows < a.count ? begin + kRows : a.count;
+    if (a.bands.param) {  // first, while the means are those that were drawn
+      alignas(64) float rows[kWide * kMaxBands * 3 + 1] = {};
+      for (int64_t i = begin; i < end; i += kWide) adam_bands(a, a.bands, i, end - i < kWide ? static_cast<int>(end - i) : kWide, rows);
+    }
+    for (const AdamParameter& of : a.others)
+      if (of.param) adam_span(a, of, begin * of.stride, (end - begin) * of.stride, of.grad + begin * of.stride);
   });
 }
 

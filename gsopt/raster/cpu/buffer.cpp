@@ -1,5 +1,8 @@
 #include <cstdlib>
 #include <new>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #include "frame.h"
 
@@ -7,14 +10,20 @@ namespace gsopt {
 
 Buffer::~Buffer() { std::free(data_); }
 
+// Large buffers lie on large pages where the system has them: splats are looked up all over, and each page costs a look too.
 void Buffer::reserve(size_t bytes) {
   if (bytes <= capacity_) return;
-  const size_t grown = (bytes + bytes / 4 + 4095) / 4096 * 4096;  // a quarter to spare: scenes grow a little at a time
+  constexpr size_t kPage = 4096, kLargePage = size_t{1} << 21;
+  const size_t wanted = bytes + bytes / 4;  // a quarter to spare: scenes grow a little at a time
+  const size_t page = wanted < 8 * kLargePage ? kPage : kLargePage, grown = (wanted + page - 1) / page * page;
   std::free(data_);
   capacity_ = 0;
-  data_ = std::aligned_alloc(4096, grown);
+  data_ = std::aligned_alloc(page, grown);
   if (!data_) throw std::bad_alloc();
   capacity_ = grown;
+#if defined(MADV_HUGEPAGE)
+  if (page == kLargePage) madvise(data_, grown, MADV_HUGEPAGE);
+#endif
 }
 
 }  // namespace gsopt

@@ -67,7 +67,7 @@ struct Parameters {
 };
 
 struct ParameterGradients {
-  float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;  // last may be null
+  float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;  // shN and the last may be null
 };
 
 // What a frame does not compute because no pixel would change; each can be switched off, to see what it is worth.
@@ -122,11 +122,24 @@ struct PhotometricArguments {
   double l1, ssim;  // out: means
 };
 
+constexpr int kMaxBands = 15;  // rows of shN
+
+// One tensor of the Gaussians, `stride` numbers each; param is null where it is left alone.
+struct AdamParameter {
+  float *param = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
+  const float* grad = nullptr;
+  int64_t stride = 0;
+  float step_size = 0, inv_sqrt_correction2 = 0;
+};
+
 struct AdamArguments {
-  float *param, *exp_avg, *exp_avg_sq;
-  const float* grad;
-  int64_t rows, stride, active;  // the first `active` floats of each row of `stride` are stepped
-  float step_size, beta1, beta2, inv_sqrt_correction2, eps;
+  int64_t count;
+  float beta1, beta2, eps;
+  AdamParameter bands;      // shN without a gradient, which is found from the rest
+  AdamParameter others[6];
+  const float *means, *v_sh0;
+  Camera camera;
+  int sh_degree;
 };
 
 // One picture's windows against one other picture (cpu/match.h); pixels padded to a multiple of eight.

@@ -8,6 +8,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
@@ -96,12 +97,14 @@ template <class Array> auto* data_of(const Array& a, size_t size, const char* na
 }
 
 struct Model {
-  In means, quats, log_scales, logit_opacities, sh0, shN;
+  Out means, quats, log_scales, logit_opacities, sh0, shN;
+  std::array<Out*, 6> all() { return {&means, &quats, &log_scales, &logit_opacities, &sh0, &shN}; }
 };
 
 Parameters parameters_of(const Model& m, int sh_degree) {
   const size_t n = m.logit_opacities.size();
   const int rest = n ? static_cast<int>(m.shN.size() / (3 * n)) : 0;
+  if (rest > kMaxBands) throw std::invalid_argument("shN holds more than three bands");
   if ((sh_degree + 1) * (sh_degree + 1) - 1 > rest && n) throw std::invalid_argument("shN holds fewer bands than sh_degree asks for");
   return {static_cast<int64_t>(n),
           sh_degree,
@@ -177,7 +180,9 @@ void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, con
 }
 
 struct Gradient {
-  Out means, quats, log_scales, logit_opacities, sh0, shN, means2d;
+  Out means, quats, log_scales, logit_opacities, sh0;
+  std::optional<Out> shN;
+  Out means2d;
   std::optional<Out> means2d_abs;
 };
 
@@ -192,7 +197,7 @@ void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std:
                                   data_of(g.log_scales, 3 * n, "v_log_scales"),
                                   data_of(g.logit_opacities, n, "v_logit_opacities"),
                                   data_of(g.sh0, 3 * n, "v_sh0"),
-                                  data_of(g.shN, 3 * n * P.sh_rest, "v_shN"),
+                                  g.shN ? data_of(*g.shN, 3 * n * P.sh_rest, "v_shN") : nullptr,
                                   data_of(g.means2d, 2 * n, "v_means2d"),
                                   g.means2d_abs ? data_of(*g.means2d_abs, 2 * n, "v_means2d_abs") : nullptr};
   nb::gil_scoped_release release;
@@ -210,14 +215,24 @@ std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Ou
   return {a.l1, a.ssim};
 }
 
-void adam(Workspace& ws, Out param, In grad, Out exp_avg, Out exp_avg_sq, int64_t rows, int64_t active, double lr, double beta1,
-          double beta2, double eps, int64_t step) {
-  const size_t size = param.size();
-  if (rows == 0 || size == 0) return;
-  const double c1 = 1.0 - std::pow(beta1, static_cast<double>(step)), c2 = 1.0 - std::pow(beta2, static_cast<double>(step));
-  const AdamArguments a = {param.data(), data_of(exp_avg, size, "exp_avg"), data_of(exp_avg_sq, size, "exp_avg_sq"), data_of(grad, size, "grad"),
-                           rows, static_cast<int64_t>(size) / rows, active, static_cast<float>(lr / c1), static_cast<float>(beta1),
-                           static_cast<float>(beta2), static_cast<float>(1.0 / std::sqrt(c2)), static_cast<float>(eps)};
+// Rates and numbers of steps, from 1, of the six tensors of a model; 0 steps: that tensor is left alone.
+void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_avg_sq, const std::vector<double>& lr, const std::vector<int64_t>& steps,
+          double beta1, double beta2, double eps, const Camera& camera, int sh_degree) {
+  if (lr.size() != 6 || steps.size() != 6) throw std::invalid_argument("adam: wrong number of rates or steps");
+  const Parameters P = parameters_of(model, sh_degree);
+  if (P.count == 0) return;
+  AdamArguments a = {P.count, static_cast<float>(beta1), static_cast<float>(beta2), static_cast<float>(eps), {}, {}, P.means,
+                     data_of(g.sh0, 3 * static_cast<size_t>(P.count), "v_sh0"), camera, sh_degree};
+  const std::array<Out*, 6> gradients = {&g.means, &g.quats, &g.log_scales, &g.logit_opacities, &g.sh0, g.shN ? &*g.shN : nullptr};
+  for (int k = 0; k < 6; ++k) {
+    Out &param = *model.all()[k], &m = *exp_avg.all()[k], &v = *exp_avg_sq.all()[k];
+    const size_t size = param.size();
+    if (steps[k] == 0 || size == 0) continue;
+    const double c1 = 1.0 - std::pow(beta1, static_cast<double>(steps[k])), c2 = 1.0 - std::pow(beta2, static_cast<double>(steps[k]));
+    AdamParameter& out = gradients[k] ? a.others[k] : a.bands;
+    out = {param.data(), data_of(m, size, "exp_avg"), data_of(v, size, "exp_avg_sq"), gradients[k] ? data_of(*gradients[k], size, "grad") : nullptr,
+           static_cast<int64_t>(size) / P.count, static_cast<float>(lr[k] / c1), static_cast<float>(1.0 / std::sqrt(c2))};
+  }
   nb::gil_scoped_release release;
   timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
 }
@@ -271,12 +286,16 @@ NB_MODULE(_cpu, m) {
                           double far_plane, double eps2d, bool antialiased) {
         new (self) Camera(make_camera(V, K, width, height, near_plane, far_plane, eps2d, antialiased));
       });
-  nb::class_<Model>(m, "Model").def(nb::init<In, In, In, In, In, In>());
+  // noconvert: what is to be written must not be a copy.
+  nb::class_<Model>(m, "Model")
+      .def(nb::init<Out, Out, Out, Out, Out, Out>(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
+           nb::arg().noconvert(), nb::arg().noconvert());
   nb::class_<Gradient>(m, "Gradient")
-      .def("__init__", [](Gradient* self, Out means, Out quats, Out log_scales, Out logit_opacities, Out sh0, Out shN, Out means2d,
+      .def("__init__", [](Gradient* self, Out means, Out quats, Out log_scales, Out logit_opacities, Out sh0, std::optional<Out> shN, Out means2d,
                           std::optional<Out> means2d_abs) {
         new (self) Gradient{means, quats, log_scales, logit_opacities, sh0, shN, means2d, means2d_abs};
-      }, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
+      }, nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
+         nb::arg().noconvert().none(), nb::arg().noconvert(), nb::arg().noconvert().none());
   m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg());
   m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg());
   m.def("photometric", &photometric);

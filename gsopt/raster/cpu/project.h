@@ -1,4 +1,4 @@
-// Stage 1 and its mirror image: Gaussians to splats, eight at a time, and gradients of splats to gradients of Gaussians.
+// Stage 1 and its mirror image: Gaussians to splats, a vector at a time, and gradients of splats to gradients of Gaussians.
 #pragma once
 #include "../common/sh.h"
 #include "frame.h"
@@ -7,10 +7,12 @@
 
 namespace gsopt::GSOPT_ISA {
 
-// Eight Gaussians from arrays of structures to one vector per field. `rows` may repeat an index: the tail is padded.
-inline Splat3D<f8> load_splats(const Parameters& P, const int64_t rows[kLanes]) {
-  alignas(32) float v[11][kLanes];
-  for (int l = 0; l < kLanes; ++l) {
+constexpr int kBandsAhead = 32;
+
+// A vector of Gaussians from arrays of structures to one vector per field. `rows` may repeat an index: the tail is padded.
+inline Splat3D<wide> load_splats(const Parameters& P, const int64_t rows[kWide]) {
+  alignas(64) float v[11][kWide];
+  for (int l = 0; l < kWide; ++l) {
     const int64_t n = rows[l];
     const float *m = P.means + 3 * n, *q = P.quats + 4 * n, *s = P.log_scales + 3 * n;
     v[0][l] = m[0], v[1][l] = m[1], v[2][l] = m[2];
@@ -18,25 +20,36 @@ inline Splat3D<f8> load_splats(const Parameters& P, const int64_t rows[kLanes]) 
     v[7][l] = s[0], v[8][l] = s[1], v[9][l] = s[2];
     v[10][l] = P.logit_opacities[n];
   }
-  f8 f[11];
-  for (int k = 0; k < 11; ++k) f[k] = load8(v[k]);
+  wide f[11];
+  for (int k = 0; k < 11; ++k) f[k] = load_wide(v[k]);
   return {{f[0], f[1], f[2]}, f[3], f[4], f[5], f[6], {f[7], f[8], f[9]}, f[10]};
 }
 
-inline Vec3<f8> view_directions(const Camera& cam, const Vec3<f8>& offset, f8& inverse_distance) {
-  const Vec3<f8> d = offset - splat3<f8>(cam.center);
-  inverse_distance = splat<f8>(1.f) / sqrt(max(dot(d, d), splat<f8>(1e-30f)));
+template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<F>& offset, F& inverse_distance) {
+  const Vec3<F> d = offset - splat3<F>(cam.center);
+  inverse_distance = splat<F>(1.f) / sqrt(max(dot(d, d), splat<F>(1e-30f)));
   return d * inverse_distance;
 }
 
-// Bands 1.. of a row of shN as 4-float groups (r, g, b, next r): the fourth lane is dropped later. The last
-// coefficient of the last row would read past the end, so it is put together by hand.
-inline f4 load_rgb(const float* sh, bool last) { return last ? f4{sh[0], sh[1], sh[2], 0.f} : load4(sh); }
+// Calls visit(k, (r, g, b, anything)) for the first `bands` coefficients of row n of shN. Four floats are read for each, but for the
+// last of a row, behind which there may be nothing.
+template <class Visit> inline void for_each_band(const Parameters& P, int64_t n, int bands, Visit&& visit) {
+  const float* sh = P.shN + 3 * P.sh_rest * n;
+  const int safe = bands < P.sh_rest ? bands : bands - 1;
+  for (int k = 0; k < safe; ++k) visit(k, load4(sh + 3 * k));
+  for (int k = safe > 0 ? safe : 0; k < bands; ++k) visit(k, f4{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2], 0.f});
+}
 
-inline f4 sh_color(const Parameters& P, int64_t n, const float Y[][kLanes], int lane, int bands) {
-  const float *dc = P.sh0 + 3 * n, *rest = P.shN + 3 * P.sh_rest * n;
+// Bands of a Gaussian that is needed soon: a page of memory ends every twenty of them, and no processor looks beyond.
+inline void prefetch_bands(const Parameters& P, int64_t n) {
+  const float* row = P.shN + 3 * P.sh_rest * (n + kBandsAhead < P.count ? n + kBandsAhead : n);
+  for (int k = 0; k < 3 * P.sh_rest; k += 16) __builtin_prefetch(row + k);
+}
+
+inline f4 sh_color(const Parameters& P, int64_t n, const float Y[][kWide], int lane, int bands) {
+  const float* dc = P.sh0 + 3 * n;
   f4 c = f4{dc[0], dc[1], dc[2], 0.f} * kSH0 + 0.5f;
-  for (int k = 0; k < bands; ++k) c += load_rgb(rest + 3 * k, k == P.sh_rest - 1) * Y[k][lane];
+  for_each_band(P, n, bands, [&](int k, f4 sh) { c += sh * Y[k][lane]; });
   return c;
 }
 
@@ -49,35 +62,35 @@ struct Visible {
 // One vector of Gaussians.
 inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, Visible& visible) {
   const Camera& cam = frame.camera;
-  int64_t index[kLanes];
-  for (int l = 0; l < kLanes; ++l) index[l] = first + (l < lanes ? l : 0);
-  const Splat3D<f8> g = load_splats(P, index);
-  const Projected<f8> p = project(cam, g);
+  int64_t index[kWide];
+  for (int l = 0; l < kWide; ++l) index[l] = first + (l < lanes ? l : 0);
+  const Splat3D<wide> g = load_splats(P, index);
+  const Projected<wide> p = project(cam, g);
 
-  const f8 k = splat<f8>(kHalfLog2E);
-  const Whitening<f8> L = whitening(p);
-  const f8 A = L.A * kSqrtHalfLog2E, B = L.B * kSqrtHalfLog2E, C = L.C * kSqrtHalfLog2E;
-  const f8 lo = log2(max(p.opacity, splat<f8>(1e-37f)));
-  const f8 reach = max(lo - kLog2AlphaMin, splat<f8>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
-  const f8 rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
-  const i8 ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
+  const wide k = splat<wide>(kHalfLog2E);
+  const Whitening<wide> L = whitening(p);
+  const wide A = L.A * kSqrtHalfLog2E, B = L.B * kSqrtHalfLog2E, C = L.C * kSqrtHalfLog2E;
+  const wide lo = log2(max(p.opacity, splat<wide>(1e-37f)));
+  const wide reach = max(lo - kLog2AlphaMin, splat<wide>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
+  const wide rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
+  const widei ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
                 (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) & (p.my + ry > 0.f) &
                 (p.my - ry < static_cast<float>(cam.height));
   const int mask = movemask(ok) & ((1 << lanes) - 1);
 
-  alignas(32) float Y[15][kLanes], out[10][kLanes], rad[2][kLanes];
+  alignas(64) float Y[15][kWide], out[10][kWide], rad[2][kWide];
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   if (mask) {
-    f8 basis[15], inv;
-    const Vec3<f8> d = view_directions(cam, p.offset, inv);
+    wide basis[15], inv;
+    const Vec3<wide> d = view_directions(cam, p.offset, inv);
     sh_basis(frame.sh_degree, d.x, d.y, d.z, basis);
-    for (int b = 0; b < bands; ++b) store8(Y[b], basis[b]);
-    const f8 fields[8] = {p.mx, p.my, A, B, C, lo, p.t.z, p.t.z};
-    for (int f = 0; f < 7; ++f) store8(out[f], fields[f]);
-    store8(rad[0], rx), store8(rad[1], ry);
+    for (int b = 0; b < bands; ++b) store_wide(Y[b], basis[b]);
+    const wide fields[8] = {p.mx, p.my, A, B, C, lo, p.t.z, p.t.z};
+    for (int f = 0; f < 7; ++f) store_wide(out[f], fields[f]);
+    store_wide(rad[0], rx), store_wide(rad[1], ry);
   }
-  TileBox boxes[kLanes] = {};
-  uint64_t tiles[kLanes] = {};
+  TileBox boxes[kWide] = {};
+  uint64_t tiles[kWide] = {};
   for (int l = 0; l < lanes; ++l)
     if (mask >> l & 1) boxes[l] = tile_box(frame, out[0][l], out[1][l], rad[0][l], rad[1][l]);
   if (mask && frame.skips.tiles) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);
@@ -111,7 +124,7 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
   parallel(pool, chunks, [&](int chunk, int) {
     const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk, end = end_of(begin);
     Visible visible = {ids + begin, keys + begin, {}};
-    for (int64_t i = begin; i < end; i += kLanes) project_lanes(frame, P, i, end - i < kLanes ? static_cast<int>(end - i) : kLanes, radii, visible);
+    for (int64_t i = begin; i < end; i += kWide) project_lanes(frame, P, i, end - i < kWide ? static_cast<int>(end - i) : kWide, radii, visible);
     found[chunk] = visible.found;
   });
   frame.visible = frame.intersections = 0;
@@ -135,83 +148,74 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
   covers[P.count].slot = static_cast<uint32_t>(frame.intersections);
 }
 
-// dLoss/d(shN row) = Y ⊗ dLoss/dcolor; returns dLoss/d(direction) before normalisation.
-inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (*Y)[kLanes], const float (*Yx)[kLanes],
-                        const float (*Yy)[kLanes], const float (*Yz)[kLanes], int lane, const float* v_color, float* v_sh,
+// dLoss/d(shN row) = Y ⊗ dLoss/dcolor, where there is room for it; returns dLoss/d(direction) before normalisation.
+inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (*Y)[kWide], const float (*Yx)[kWide],
+                        const float (*Yy)[kWide], const float (*Yz)[kWide], int lane, const float* v_color, float* v_sh,
                         float* v_direction) {
-  const float* rest = P.shN + 3 * P.sh_rest * n;
   const f4 v = {v_color[0], v_color[1], v_color[2], 0.f};
   f4 dx = splat<f4>(0.f), dy = dx, dz = dx;
-  for (int k = 0; k < bands; ++k) {
-    const bool last = k == P.sh_rest - 1;
-    const f4 sh = load_rgb(rest + 3 * k, last);
-    dx += sh * Yx[k][lane], dy += sh * Yy[k][lane], dz += sh * Yz[k][lane];
-    const f4 g = v * Y[k][lane];
-    if (last) {
-      v_sh[3 * k] = g[0], v_sh[3 * k + 1] = g[1], v_sh[3 * k + 2] = g[2];
-    } else {
-      store4(v_sh + 3 * k, g);  // the fourth lane is overwritten by the next coefficient or cleared below
-    }
-  }
-  for (int k = 3 * bands; k < 3 * P.sh_rest; ++k) v_sh[k] = 0.f;
+  for_each_band(P, n, bands, [&](int k, f4 sh) { dx += sh * Yx[k][lane], dy += sh * Yy[k][lane], dz += sh * Yz[k][lane]; });
   v_direction[0] = dx[0] * v[0] + dx[1] * v[1] + dx[2] * v[2];
   v_direction[1] = dy[0] * v[0] + dy[1] * v[1] + dy[2] * v[2];
   v_direction[2] = dz[0] * v[0] + dz[1] * v[1] + dz[2] * v[2];
+  if (!v_sh) return;
+  for (int k = 0; k < bands; ++k)
+    for (int ch = 0; ch < 3; ++ch) v_sh[3 * k + ch] = v[ch] * Y[k][lane];
+  for (int k = 3 * bands; k < 3 * P.sh_rest; ++k) v_sh[k] = 0.f;
 }
 
 // The rows of one splat, summed in slot order; false when all are zero, or there are none: no pixel saw it.
 inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
   const float* row = frame.rows.as<float>() + static_cast<int64_t>(cover->slot) * kRow;
-  f8 a = splat<f8>(0.f), b = a;
-  for (uint32_t k = cover[0].slot; k < cover[1].slot; ++k, row += kRow) a += load8(row), b += load8(row + 8);
-  store8(out, a), store8(out + 8, b);
-  return any((a != 0.f) | (b != 0.f));
+  wide sum[kRow / kWide] = {};
+  for (uint32_t k = cover[0].slot; k < cover[1].slot; ++k, row += kRow)
+    for (int h = 0; h < kRow / kWide; ++h) sum[h] += load_wide(row + h * kWide);
+  widei nonzero = splat_widei(0);
+  for (int h = 0; h < kRow / kWide; ++h) store_wide(out + h * kWide, sum[h]), nonzero |= sum[h] != 0.f;
+  return any(nonzero);
 }
 
-inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kLanes],
-                                   const float sums[kLanes][kRow], int lanes) {
+inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kWide],
+                                   const float sums[kWide][kRow], int lanes) {
   const Camera& cam = frame.camera;
   const Record* records = frame.records.as<Record>();
-  f8 field[kRow];
-  for (int h = 0; h < 2; ++h) {
-    for (int l = 0; l < 8; ++l) field[8 * h + l] = load8(sums[l] + 8 * h);
-    transpose8(field + 8 * h);
-  }
-  const Splat3D<f8> g = load_splats(P, index);
-  const Projected<f8> p = project(cam, g);
-  const Whitening<f8> L = whitening(p);
+  wide field[kRow];
+  for (int h = 0; h < kRow; h += 8) load_columns(sums[0] + h, kRow, field + h);
+  const Splat3D<wide> g = load_splats(P, index);
+  const Projected<wide> p = project(cam, g);
+  const Whitening<wide> L = whitening(p);
   // Blending measures u and v in units of sqrt(kHalfLog2E).
   constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
-  const f8 su = field[kSu] * length, sv = field[kSv] * length;
-  const SplatGradient<f8> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
+  const wide su = field[kSu] * length, sv = field[kSv] * length;
+  const SplatGradient<wide> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
                                L.A * su, L.B * su + L.C * sv, field[kWz]};
-  Splat3D<f8> out = project_backward(cam, p, L, v);
+  Splat3D<wide> out = project_backward(cam, p, L, v);
 
-  f8 basis[15], bx[15], by[15], bz[15], inv;
-  alignas(32) float Y[15][kLanes], Yx[15][kLanes], Yy[15][kLanes], Yz[15][kLanes];
-  const Vec3<f8> d = view_directions(cam, p.offset, inv);
+  wide basis[15], bx[15], by[15], bz[15], inv;
+  alignas(64) float Y[15][kWide], Yx[15][kWide], Yy[15][kWide], Yz[15][kWide];
+  const Vec3<wide> d = view_directions(cam, p.offset, inv);
   const int degree = frame.sh_degree, bands = (degree + 1) * (degree + 1) - 1;
   sh_basis(degree, d.x, d.y, d.z, basis);
   sh_basis_gradient(degree, d.x, d.y, d.z, bx, by, bz);
-  for (int k = 0; k < bands; ++k) store8(Y[k], basis[k]), store8(Yx[k], bx[k]), store8(Yy[k], by[k]), store8(Yz[k], bz[k]);
-  alignas(32) float vd[3][kLanes] = {};
+  for (int k = 0; k < bands; ++k) store_wide(Y[k], basis[k]), store_wide(Yx[k], bx[k]), store_wide(Yy[k], by[k]), store_wide(Yz[k], bz[k]);
+  alignas(64) float vd[3][kWide] = {};
   for (int l = 0; l < lanes; ++l) {
     const int64_t n = index[l];
     const Record& r = records[n];
     float direction[3];
     const float color[3] = {r.r > 0.f ? sums[l][kWr] : 0.f, r.g > 0.f ? sums[l][kWg] : 0.f, r.b > 0.f ? sums[l][kWb] : 0.f};
     for (int ch = 0; ch < 3; ++ch) G.sh0[3 * n + ch] = color[ch] * kSH0;
-    sh_backward(P, n, bands, Y, Yx, Yy, Yz, l, color, G.shN + 3 * P.sh_rest * n, direction);
+    sh_backward(P, n, bands, Y, Yx, Yy, Yz, l, color, G.shN ? G.shN + 3 * P.sh_rest * n : nullptr, direction);
     for (int a3 = 0; a3 < 3; ++a3) vd[a3][l] = direction[a3];
   }
-  Vec3<f8> u = {load8(vd[0]), load8(vd[1]), load8(vd[2])};
+  Vec3<wide> u = {load_wide(vd[0]), load_wide(vd[1]), load_wide(vd[2])};
   u = (u - d * dot(u, d)) * inv;
   out.mean = out.mean + u;
 
-  const f8 results[15] = {out.mean.x, out.mean.y,      out.mean.z,      out.qw,          out.qx,    out.qy, out.qz, out.log_scale.x,
+  const wide results[15] = {out.mean.x, out.mean.y,      out.mean.z,      out.qw,          out.qx,    out.qy, out.qz, out.log_scale.x,
                           out.log_scale.y, out.log_scale.z, out.logit, v.mx, v.my, field[kAbsX], field[kAbsY]};
-  alignas(32) float t[15][kLanes];
-  for (int k = 0; k < 15; ++k) store8(t[k], results[k]);
+  alignas(64) float t[15][kWide];
+  for (int k = 0; k < 15; ++k) store_wide(t[k], results[k]);
   for (int l = 0; l < lanes; ++l) {
     const int64_t n = index[l];
     for (int k = 0; k < 3; ++k) G.means[3 * n + k] = t[k][l], G.log_scales[3 * n + k] = t[7 + k][l];
@@ -229,7 +233,7 @@ inline void zero_gradient(const Parameters& P, const ParameterGradients& G, int6
   G.logit_opacities[n] = 0.f;
   G.means2d[2 * n] = G.means2d[2 * n + 1] = 0.f;
   if (G.means2d_abs) G.means2d_abs[2 * n] = G.means2d_abs[2 * n + 1] = 0.f;
-  if (P.sh_rest) std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
+  if (G.shN && P.sh_rest) std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
 }
 
 // Gaussians that no pixel saw get zeros; the others are packed into full vectors, in index order.
@@ -238,19 +242,20 @@ inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P
   parallel(pool, divide_up(P.count, kProjectChunk), [&](int chunk, int) {
     const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
     const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
-    int64_t index[kLanes];
-    alignas(64) float sums[kLanes][kRow] = {};
+    int64_t index[kWide];
+    alignas(64) float sums[kWide][kRow] = {};
     int lanes = 0;
     for (int64_t n = begin; n < end; ++n) {
       if (!sum_rows(frame, &covers[n], sums[lanes])) {
         zero_gradient(P, G, n);
         continue;
       }
+      prefetch_bands(P, n);
       index[lanes++] = n;
-      if (lanes == kLanes) project_backward_lanes(frame, P, G, index, sums, lanes), lanes = 0;
+      if (lanes == kWide) project_backward_lanes(frame, P, G, index, sums, lanes), lanes = 0;
     }
     if (lanes) {
-      for (int l = lanes; l < kLanes; ++l) index[l] = index[0];
+      for (int l = lanes; l < kWide; ++l) index[l] = index[0];
       project_backward_lanes(frame, P, G, index, sums, lanes);
     }
   });

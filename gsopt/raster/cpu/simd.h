@@ -1,6 +1,6 @@
 // Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the language has no
-// operator. 8 lanes hold Gaussians; 8, or with GSOPT_SIXTEEN 16, hold the pixels of a block
-// (`px`) and whatever else is as wide as it can be (`wide`).
+// operator. 8 lanes, or with GSOPT_SIXTEEN 16, hold the pixels of a block (`px`) and Gaussians and whatever else is as wide as it
+// can be (`wide`).
 // Included once per instruction set; everything lives in that set's own namespace.
 #pragma once
 #include <bit>
@@ -21,7 +21,7 @@ using f4u = float __attribute__((vector_size(16), aligned(4), may_alias));
 using f8u = float __attribute__((vector_size(32), aligned(4), may_alias));
 using i8u = int32_t __attribute__((vector_size(32), aligned(4), may_alias));
 
-constexpr int kLanes = 8;  // Gaussians per vector
+constexpr int kLanes = 8;
 
 inline f4 load4(const float* p) { return *reinterpret_cast<const f4u*>(p); }
 inline void store4(float* p, f4 v) { *reinterpret_cast<f4u*>(p) = v; }
@@ -100,6 +100,7 @@ inline f16 from_bits(i16 v) { return (f16)v; }
 inline f16 keep(i16 m, f16 a) { return (f16)(m & (i16)a); }
 inline f16 select(i16 m, f16 a, f16 b) { return m ? a : b; }
 inline i16 select(i16 m, i16 a, i16 b) { return m ? a : b; }
+inline f16 to_float(i16 v) { return __builtin_convertvector(v, f16); }
 inline i16 to_int(f16 v) { return __builtin_convertvector(v, i16); }  // truncates
 inline f16 joined(f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
@@ -152,6 +153,7 @@ using wide = px;
 using widei = pxi;
 inline widei splat_widei(int32_t x) { return splat_pxi(x); }
 inline void store_widei(int32_t* p, widei v) { store_pxi(p, v); }
+inline widei load_widei(const int32_t* p) { return load_pxi(p); }
 inline wide load_wide(const float* p) { return load_px(p); }
 inline void store_wide(float* p, wide v) { store_px(p, v); }
 constexpr int kWide = sizeof(wide) / sizeof(float);
@@ -193,19 +195,19 @@ template <> inline f16 exp2<f16>(f16 x) {
 }
 #endif
 
-inline f8 exp(f8 x) { return exp2(clamp(x * splat<f8>(1.44269504089f), splat<f8>(-125.f), splat<f8>(125.f))); }
+template <class V> inline V exp(V x) { return exp2(clamp(x * splat<V>(1.44269504089f), splat<V>(-125.f), splat<V>(125.f))); }
 
 // log2(x) for normal x > 0: x = 2^k m with m in [sqrt(1/2), sqrt(2)), then the series of atanh((m-1)/(m+1)).
-inline f8 log2(f8 x) {
-  const i8 k = (bits(x) - splat8i(0x3f3504f3)) >> 23;
-  const f8 m = from_bits(bits(x) - (k << 23));
-  const f8 one = splat<f8>(1.f), s = (m - one) / (m + one), s2 = s * s;
-  f8 p = splat<f8>(1.f / 9);
-  p = p * s2 + splat<f8>(1.f / 7);
-  p = p * s2 + splat<f8>(1.f / 5);
-  p = p * s2 + splat<f8>(1.f / 3);
+template <class V> inline V log2(V x) {
+  const auto k = (bits(x) - 0x3f3504f3) >> 23;
+  const V m = from_bits(bits(x) - (k << 23));
+  const V one = splat<V>(1.f), s = (m - one) / (m + one), s2 = s * s;
+  V p = splat<V>(1.f / 9);
+  p = p * s2 + splat<V>(1.f / 7);
+  p = p * s2 + splat<V>(1.f / 5);
+  p = p * s2 + splat<V>(1.f / 3);
   p = p * s2 + one;
-  return to_float(k) + p * s * splat<f8>(2.88539008178f);
+  return to_float(k) + p * s * splat<V>(2.88539008178f);
 }
 
 // Rows become columns: r[i][j] -> r[j][i].
@@ -227,11 +229,11 @@ inline void transpose8(f8 r[8]) {
   }
 }
 
-// kWide rows of eight floats become eight columns.
+// Eight floats of each of kWide rows become eight columns.
 #if defined(GSOPT_SIXTEEN)
-inline void load_columns(const float* rows, f16 v[8]) {
+inline void load_columns(const float* rows, int stride, f16 v[8]) {
   f16 a[8], b[8];
-  for (int i = 0; i < 8; ++i) v[i] = joined(load8(rows + 8 * i), load8(rows + 8 * (i + 8)));
+  for (int i = 0; i < 8; ++i) v[i] = joined(load8(rows + stride * i), load8(rows + stride * (i + 8)));
   for (int i = 0; i < 8; i += 2) {
     a[i] = __builtin_shufflevector(v[i], v[i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
     a[i + 1] = __builtin_shufflevector(v[i], v[i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
@@ -248,8 +250,8 @@ inline void load_columns(const float* rows, f16 v[8]) {
   }
 }
 #else
-inline void load_columns(const float* rows, f8 v[8]) {
-  for (int i = 0; i < 8; ++i) v[i] = load8(rows + 8 * i);
+inline void load_columns(const float* rows, int stride, f8 v[8]) {
+  for (int i = 0; i < 8; ++i) v[i] = load8(rows + stride * i);
   transpose8(v);
 }
 #endif

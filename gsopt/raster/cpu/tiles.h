@@ -24,30 +24,30 @@ inline TileBox tile_box(const Frame& frame, float mx, float my, float rx, float 
           clamp_int((my - ry) * inv, frame.tiles_y), clamp_int((my + ry) * inv + 1.f, frame.tiles_y)};
 }
 
-// Masks of eight splats at once; of a box that is larger the result is arbitrary.
-inline void tile_masks(f8 mx, f8 my, f8 A, f8 B, f8 C, f8 lo, const TileBox box[kLanes], uint64_t out[kLanes]) {
-  alignas(32) int32_t x0[kLanes], y0[kLanes], columns[kLanes], rows[kLanes], bits[kLanes];
+// Masks of a vector of splats; of a box that is larger the result is arbitrary.
+inline void tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, const TileBox box[kWide], uint64_t out[kWide]) {
+  alignas(64) int32_t x0[kWide], y0[kWide], columns[kWide], rows[kWide], bits[kWide];
   int most = 0;
-  for (int l = 0; l < kLanes; ++l) {
+  for (int l = 0; l < kWide; ++l) {
     x0[l] = box[l].x0, y0[l] = box[l].y0, columns[l] = box[l].x1 - box[l].x0, rows[l] = box[l].y1 - box[l].y0, out[l] = 0;
     most = rows[l] > most && box[l].masked() ? rows[l] : most;
   }
-  const f8 zero = splat<f8>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f, iA = splat<f8>(1.f) / A, slope = B * iA;
-  const f8 extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
-  const f8 x = mx - to_float(load8i(x0)) * static_cast<float>(kTile), first_row = to_float(load8i(y0)) * static_cast<float>(kTile) + 0.5f - my;
-  const i8 one = splat8i(1), inside = shift_left(one, load8i(columns)) - one;
+  const wide zero = splat<wide>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f, iA = splat<wide>(1.f) / A, slope = B * iA;
+  const wide extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
+  const wide x = mx - to_float(load_widei(x0)) * static_cast<float>(kTile), first_row = to_float(load_widei(y0)) * static_cast<float>(kTile) + 0.5f - my;
+  const widei one = splat_widei(1), inside = shift_left(one, load_widei(columns)) - one;
   for (int row = 0; row < most; ++row) {
-    const f8 top = first_row + static_cast<float>(row * kTile), bottom = top + (kTile - 1.f);
-    const f8 yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
-    const f8 cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
-    const f8 margin = (abs(slope * yr) + abs(mx)) * 2e-6f + 0.02f;
-    const f8 right = x - slope * yr + sqrt(max(sr, zero)) * iA + margin;
-    const f8 left = x - slope * yl - sqrt(max(sl, zero)) * iA - margin;
-    const i8 behind = to_int(clamp((right + (kTile - 0.5f)) * (1.f / kTile), zero, splat<f8>(kMaskSide + 0.5f)));
-    const i8 first = splat8i(kMaskSide) - to_int(clamp(splat<f8>(kMaskSide) - (left - (kTile - 0.5f)) * (1.f / kTile), zero, splat<f8>(kMaskSide + 0.5f)));
-    const i8 touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside;
-    store8i(bits, touched & ((sr >= 0.f) | (sl >= 0.f)) & (load8i(rows) > splat8i(row)));
-    for (int l = 0; l < kLanes; ++l) out[l] |= static_cast<uint64_t>(bits[l]) << (kMaskSide * row);
+    const wide top = first_row + static_cast<float>(row * kTile), bottom = top + (kTile - 1.f);
+    const wide yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
+    const wide cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
+    const wide margin = (abs(slope * yr) + abs(mx)) * 2e-6f + 0.02f;
+    const wide right = x - slope * yr + sqrt(max(sr, zero)) * iA + margin;
+    const wide left = x - slope * yl - sqrt(max(sl, zero)) * iA - margin;
+    const widei behind = to_int(clamp((right + (kTile - 0.5f)) * (1.f / kTile), zero, splat<wide>(kMaskSide + 0.5f)));
+    const widei first = splat_widei(kMaskSide) - to_int(clamp(splat<wide>(kMaskSide) - (left - (kTile - 0.5f)) * (1.f / kTile), zero, splat<wide>(kMaskSide + 0.5f)));
+    const widei touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside;
+    store_widei(bits, touched & ((sr >= 0.f) | (sl >= 0.f)) & (load_widei(rows) > splat_widei(row)));
+    for (int l = 0; l < kWide; ++l) out[l] |= static_cast<uint64_t>(bits[l]) << (kMaskSide * row);
   }
 }
 
