@@ -8,7 +8,7 @@ namespace gsopt::GSOPT_ISA {
 
 constexpr int kRadixBits = 11, kRadix = 1 << kRadixBits;
 constexpr int kSortChunk = 1 << 15;
-constexpr int kAhead = 16;  // splats are visited in depth order, that is anywhere in memory: ask for them early
+constexpr int kAhead = 48;  // splats are visited in depth order, that is anywhere in memory: ask for them early
 
 // Least significant digit first, 3 passes of 11 bits; chunks of the input keep their order, so ties go by index.
 inline void sort_stage(Pool& pool, Frame& frame) {
