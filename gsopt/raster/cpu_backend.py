@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -53,7 +52,7 @@ class CpuBackend:
 
     def __init__(self, threads: int = 0) -> None:
         self._workspace = workspace(threads)
-        self._handles = _Handles()
+        self._views = _Views()
         self._idle: list[Any] = []  # frames whose buffers can be used again
 
     @property
@@ -77,8 +76,8 @@ class CpuBackend:
         """See `Backend.forward`."""
         height, width, n = camera.height, camera.width, len(gaussians)
         gaussians = _as_float32(gaussians)
-        model = self._handles.model(gaussians)
-        view = self._handles.view(camera, settings)
+        model = _model(gaussians)
+        view = self._views.of(camera, settings)
         frame = self._idle.pop() if self._idle else _cpu.Frame()
         colors, alphas = torch.empty(height, width, 3), torch.empty(height, width)
         depths = torch.empty(height, width) if depth else None
@@ -110,7 +109,7 @@ class CpuBackend:
         assert isinstance(context, _Context)
         buffers = context.take()
         gradients = _overwritable(context.gaussians, absgrad, bands, into)
-        out = self._handles.gradient(gradients)
+        out = _gradient(gradients)
         alphas, depths = _contiguous(v_alphas), _contiguous(v_depths)
         _cpu.backward(self._workspace, buffers, context.model, _contiguous(v_colors), alphas, depths, out)
         self._idle.append(buffers)
@@ -143,45 +142,60 @@ class CpuBackend:
         settings: RasterSettings,
     ) -> None:
         """See `Backend.adam`. All tensors must be float32 and contiguous."""
-        model, m, v = (self._handles.model(record) for record in (gaussians, exp_avg, exp_avg_sq))
-        out = self._handles.gradient(gradients)
+        model, m, v = (_model(record) for record in (gaussians, exp_avg, exp_avg_sq))
+        out = _gradient(gradients)
         rates = [step.lr.get(name, 0.0) for name in PARAMETERS]
         steps = [step.steps[name] if name in step.lr else 0 for name in PARAMETERS]
-        view, degree = self._handles.view(camera, settings), min(settings.sh_degree, gaussians.sh_degree)
+        view, degree = self._views.of(camera, settings), min(settings.sh_degree, gaussians.sh_degree)
         _cpu.adam(self._workspace, model, out, m, v, rates, steps, step.beta1, step.beta2, step.eps, view, degree)
 
 
-class _Handles:
-    """What the kernels make of a record, kept as long as that record: each takes microseconds for every tensor."""
+def _model(record: Gaussians) -> Any:
+    return _handle(record, _cpu.Model, PARAMETERS)
 
-    def __init__(self) -> None:
-        self._known: dict[int, Any] = {}
 
-    def model(self, record: Gaussians) -> Any:
-        """Views of the tensors, which must be float32 and contiguous."""
-        return self._of(record, lambda: _cpu.Model(*(getattr(record, name) for name in PARAMETERS)))
+def _gradient(record: Gradients) -> Any:
+    return _handle(record, _cpu.Gradient, GRADIENTS)
 
-    def gradient(self, record: Gradients) -> Any:
-        """Views of the tensors, which must be float32 and contiguous."""
-        return self._of(record, lambda: _cpu.Gradient(*(getattr(record, name) for name in GRADIENTS)))
 
-    def view(self, camera: Cameras, settings: RasterSettings) -> Any:
-        """A copy of the one camera of `camera`, made again when that was changed in place."""
+_handles: dict[int, tuple[tuple[int, ...], Any]] = {}
+"""Views of records that the kernels have seen, by id, as long as these live: making one takes a microsecond or more for
+every tensor. And where the tensors' memory lay."""
+
+
+def _handle(record: Any, made_by: Any, names: tuple[str, ...]) -> Any:
+    """The kernels' view of a record's tensors, which is not a copy."""
+    tensors = {name: getattr(record, name) for name in names}
+    places = tuple(0 if tensor is None else tensor.data_ptr() for tensor in tensors.values())
+    known = _handles.get(id(record))
+    if known is not None and known[0] == places:
+        return known[1]
+    for name, tensor in tensors.items():
+        if tensor is not None and (tensor.dtype != torch.float32 or not tensor.is_contiguous()):
+            raise UsageError(f"`{name}` must be contiguous float32 here, got {tensor.dtype}. Convert it first.")
+    if known is None:
+        weakref.finalize(record, _handles.pop, id(record), None)
+    _handles[id(record)] = places, made_by(*tensors.values())
+    return _handles[id(record)][1]
+
+
+MOST_VIEWS = 1024
+
+
+class _Views(dict[tuple[Any, ...], Any]):
+    """Cameras as the kernels want them, by everything that makes them."""
+
+    def of(self, camera: Cameras, settings: RasterSettings) -> Any:
+        """The one camera of `camera`."""
+        viewmat, K = camera.viewmats[0].detach(), camera.Ks[0].detach()
         drawn_by = settings.near_plane, settings.far_plane, settings.eps2d, settings.antialiased
-        key = camera.viewmats._version, camera.Ks._version, drawn_by
-        views = self._of(camera, dict)
-        if key not in views:
-            views.clear()
-            viewmat, K = camera.viewmats[0].flatten().tolist(), camera.Ks[0].flatten().tolist()
-            views[key] = _cpu.Camera(viewmat, K, camera.width, camera.height, *drawn_by)
-        return views[key]
-
-    def _of(self, record: Any, make: Callable[[], Any]) -> Any:
-        key = id(record)
-        if key not in self._known:
-            self._known[key] = make()
-            weakref.finalize(record, self._known.pop, key)
-        return self._known[key]
+        size = camera.width, camera.height
+        key = viewmat.numpy().tobytes(), viewmat.dtype, K.numpy().tobytes(), K.dtype, size, drawn_by
+        if key not in self:
+            if len(self) >= MOST_VIEWS:
+                self.clear()
+            self[key] = _cpu.Camera(viewmat.flatten().tolist(), K.flatten().tolist(), *size, *drawn_by)
+        return self[key]
 
 
 def _overwritable(gaussians: Gaussians, absgrad: bool, bands: bool, spent: Gradients | None) -> Gradients:

@@ -125,9 +125,14 @@ class Guide:
         self.sample: Sample | None = None
         """The last guided step."""
 
+    def is_due(self, step: int) -> bool:
+        """Whether this step may be guided; coverage or a failure may still leave it without."""
+        on = self.weight != 0 and not self.counts.ended
+        return on and schedule.is_guided(step, self.config, self.iterations)
+
     def gradients(self, step: int, gaussians: Gaussians, settings: RasterSettings) -> Gradients | None:
         """Gradients of lambda times the guidance loss, or None for a step without guidance."""
-        if self.weight == 0 or self.counts.ended or not schedule.is_guided(step, self.config, self.iterations):
+        if not self.is_due(step):
             return None
         self._look_around(step, gaussians)
         assert self.memory.mean_u is not None

@@ -49,7 +49,7 @@ class PoseRefinement:
 
     def camera(self, index: int, camera: Cameras) -> Cameras:
         """View `index`, which the scene has at `camera`, where it is thought to stand now."""
-        return replace(camera, viewmats=self.viewmats[index : index + 1].to(camera.viewmats))
+        return replace(camera, viewmats=self.viewmats[index : index + 1].clone().to(camera.viewmats))
 
     def update(self, index: int, step: int, gaussians: Gaussians, gradients: Gradients, sh_degree: int) -> None:
         """One Adam step of view `index` from the gradients of the frame that it drew at its present pose."""

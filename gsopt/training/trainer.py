@@ -168,7 +168,8 @@ class Trainer:
             v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha * target.share)
         weight = target.share * target.color
         v_colors = photometric.v_colors if weight == 1 else photometric.v_colors.mul_(weight)
-        absgrad, bands = self._wants_absgrad(), self._guidance is not None  # which adds its own to them
+        bands = self._guidance is not None and self._guidance.guide.is_due(self.step)  # which adds its own to them
+        absgrad = self._wants_absgrad()
         gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=absgrad, bands=bands, into=self._spent)
         self._spent = gradients
         self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])

@@ -92,7 +92,7 @@ STRESSES = (
     Stress("image 4096 x 1", "a row of such tiles", DRAWN, of_size(4096, 1)),
     Stress("image 17 x 33", "one pixel in the last tile", DRAWN, of_size(17, 33)),
     Stress("no Gaussian", "empty arrays", "the background", of_count(0)),
-    Stress("one Gaussian", "seven of eight lanes are padding", DRAWN, of_count(1)),
+    Stress("one Gaussian", "all lanes but one are padding", DRAWN, of_count(1)),
     Stress("SH coefficients 1e4", "colors of 1e4", DRAWN, bright(1e4)),
     Stress("1500 opaque layers, one lane alive", "1 / T of a saturated lane", "each lane stops itself", layers),
     Stress("after 17,885 training steps", "what no random scene holds", DRAWN, trained, gradient=MANY_LAYERS),

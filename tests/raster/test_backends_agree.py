@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import fields, replace
 
 import pytest
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from gsopt.errors import UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
-from gsopt.raster import _cpu  # type: ignore[attr-defined]
+from gsopt.raster import _cpu, cpu_backend  # type: ignore[attr-defined]
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import AdamStep, Backend, Frame, Gradients, RasterSettings
 from gsopt.raster.cpu_backend import ISA_VARIABLE, CpuBackend
@@ -244,7 +245,8 @@ def test_adam(backend: Backend, count: int) -> None:
 def test_adam_needs_no_gradient_of_the_bands(
     isa: str, stored: int, drawn_degree: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The step that finds it from that of sh0 is the one that is given it, and moves nothing that is not drawn."""
+    """The step that finds it from that of sh0 is the one that is given it, the kernels' to the last bit, and moves
+    nothing that is not drawn."""
     monkeypatch.setenv(ISA_VARIABLE, isa)
     settings = RasterSettings(sh_degree=drawn_degree)
     case = single(make_case(6, count=77, width=40, height=36, settings=settings, sh_degree=stored))
@@ -259,38 +261,72 @@ def test_adam_needs_no_gradient_of_the_bands(
             records += [random_like(records[0], torch.Generator().manual_seed(0), 0.0) for _ in range(2)]
             backend.adam(records[0], gradients, records[1], records[2], adam_step(1), case.camera, settings)
             ends[name, bands] = records
-    for name in ("cpu", "reference"):
+    for name, rtol, atol in (("cpu", 0.0, 0.0), ("reference", 1e-5, 1e-7)):
         for got, expected in zip(ends[name, False], ends[name, True], strict=True):
             for field, tensor in got.items():
-                torch.testing.assert_close(tensor, getattr(expected, field), rtol=1e-5, atol=1e-7, msg=field)
+                torch.testing.assert_close(tensor, getattr(expected, field), rtol=rtol, atol=atol, msg=field)
     moments = ends["cpu", False][1].shN
     drawn_rows = (min(stored, drawn_degree) + 1) ** 2 - 1
     assert bool((moments[:, :drawn_rows] != 0).any())
     assert not bool(moments[:, drawn_rows:].any())
 
 
-def test_what_is_changed_in_place_is_drawn_anew() -> None:
+def test_what_was_changed_is_drawn_anew() -> None:
     """The kernels' views of tensors and cameras are kept between frames."""
     case, backend = single(make_case(3, count=30)), CpuBackend(1)
-    first = draw(backend, case)
+    case.camera.viewmats.data = torch.from_numpy(viewmats := case.camera.viewmats.numpy().copy())
+    pictures = [draw(backend, case).colors]
+
+    def check() -> None:
+        pictures.append(draw(backend, case).colors)
+        torch.testing.assert_close(pictures[-1], draw(CpuBackend(1), replaced(case)).colors, rtol=0, atol=0)
+        assert not torch.equal(*pictures[-2:])
+
     case.gaussians.means.add_(0.25)
-    moved = draw(backend, case)
-    torch.testing.assert_close(moved.colors, draw(CpuBackend(1), case).colors, rtol=0, atol=0)
-    assert not torch.equal(first.colors, moved.colors)
+    check()
+    case.gaussians.means.data = case.gaussians.means + 0.25
+    check()
     case.camera.viewmats[0, 0, 3] += 0.5
-    panned = draw(backend, case)
-    torch.testing.assert_close(panned.colors, draw(CpuBackend(1), case).colors, rtol=0, atol=0)
-    assert not torch.equal(moved.colors, panned.colors)
+    check()
+    viewmats[0, 1, 3] += 0.5  # their memory, behind torch's back
+    check()
 
 
-def test_a_step_of_what_is_not_contiguous_is_refused() -> None:
-    """A copy would be stepped instead."""
+def replaced(case: Case) -> Case:
+    """The same in records that no one has seen."""
+    return replace(case, gaussians=replace(case.gaussians), camera=replace(case.camera))
+
+
+def test_records_made_in_inference_mode_are_drawn() -> None:
+    with torch.inference_mode():
+        case = single(make_case(3, count=30))
+        case = replace(case, camera=case.camera[0])
+        drawn_there = draw(CpuBackend(1), case).colors
+    torch.testing.assert_close(drawn_there, draw(CpuBackend(1), single(make_case(3, count=30))).colors, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("how", ["turned", "double"])
+def test_a_step_of_a_copy_is_refused(how: str) -> None:
+    """What is not float32 or not contiguous would have to be copied, and the copy would be stepped."""
     case, backend = single(make_case(3, count=30)), CpuBackend(1)
     gradients = backend.backward(draw(backend, case), *(w.float() for w in weights_like(case)))
-    turned = replace(case.gaussians, means=case.gaussians.means.T.contiguous().T)
-    moments = [random_like(turned, torch.Generator(), 0.0) for _ in range(2)]
-    with pytest.raises(TypeError):
-        backend.adam(turned, gradients, *moments, adam_step(1), case.camera, case.settings)
+    means = case.gaussians.means
+    wrong = replace(case.gaussians, means=means.T.contiguous().T if how == "turned" else means.double())
+    moments = [random_like(case.gaussians, torch.Generator(), 0.0) for _ in range(2)]
+    with pytest.raises(UsageError, match="means"):
+        backend.adam(wrong, gradients, *moments, adam_step(1), case.camera, case.settings)
+
+
+def test_views_of_records_go_with_them() -> None:
+    """Not with the backend, and not before."""
+    known = len(cpu_backend._handles)
+    case = single(make_case(3, count=30))
+    for _ in range(3):
+        draw(CpuBackend(1), case)
+    assert len(cpu_backend._handles) == known + 1
+    del case
+    gc.collect()
+    assert len(cpu_backend._handles) <= known
 
 
 @pytest.mark.parametrize("isa", _cpu.instruction_sets())

@@ -11,7 +11,7 @@ from tolerances import DIFFERENCE, DIFFERENCE_STEP, EXACT
 from torch import Tensor
 
 from gsopt.gaussians import PARAMETERS
-from gsopt.raster.backend import TRANSMITTANCE_MIN, Frame, RasterSettings
+from gsopt.raster.backend import TRANSMITTANCE_MIN, AdamStep, Frame, RasterSettings
 from gsopt.raster.reference import ReferenceBackend, project
 from gsopt.raster.ssim import WINDOW, ssim, ssim_map, window
 
@@ -171,3 +171,20 @@ def test_the_photometric_gradient_is_the_central_difference() -> None:
             losses.append(SMOOTH.photometric(moved, target, 0.2).loss)
         difference = (losses[0] - losses[1]) / (2 * DIFFERENCE_STEP)
         assert float(result.v_colors.view(-1)[index]) == pytest.approx(difference, abs=1e-9)
+
+
+def test_adam_takes_the_steps_of_torch() -> None:
+    case, rng = make_case(15, count=5), torch.Generator().manual_seed(0)
+    means = torch.randn(5, 3, generator=rng, dtype=torch.float64)
+    twin = means.clone().requires_grad_()
+    optimizer = torch.optim.Adam([twin], lr=1e-2, betas=(0.8, 0.99), eps=1e-15)
+    gaussians = replace(case.gaussians, means=means)
+    m, v = (replace(case.gaussians, means=torch.zeros_like(means)) for _ in range(2))
+    gradients = SMOOTH.backward(draw(case), *weights_like(case))
+    for number in range(1, 6):
+        grad = torch.randn(5, 3, generator=rng, dtype=torch.float64)
+        twin.grad = grad.clone()
+        optimizer.step()
+        step = AdamStep({"means": 1e-2}, {"means": number}, 0.8, 0.99, 1e-15)
+        SMOOTH.adam(gaussians, replace(gradients, means=grad), m, v, step, case.camera, case.settings)
+    torch.testing.assert_close(means, twin.detach(), atol=EXACT, rtol=0)

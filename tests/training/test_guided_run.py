@@ -12,7 +12,7 @@ import pytest
 import torch
 from tiny_scenes import tiny_config
 
-from gsopt.config import DataConfig, TrainConfig
+from gsopt.config import DataConfig, OptimizerConfig, TrainConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
 from gsopt.events import read_events
@@ -101,11 +101,22 @@ def test_a_prior_that_answers_nan_never_loses_the_reconstruction(
     dataset: Path, tmp_path: Path, prior: PixelPrior
 ) -> None:
     prior.answer = lambda x_t, a, c: torch.full_like(x_t, float("nan"))
-    assert train(config(dataset), tmp_path / "run").steps == 30
-    train(tiny_config(dataset, guidance=GuidanceConfig(lambda_sds=0)), tmp_path / "plain")
+    bands = OptimizerConfig(sh_degree_every=9)
+    assert train(replace(config(dataset), optimizer=bands), tmp_path / "run").steps == 30
+    train(tiny_config(dataset, optimizer=bands), tmp_path / "plain")
     guided, plain = ((tmp_path / name / "splat.ply").read_bytes() for name in ("run", "plain"))
     assert guided == plain
     assert "without guidance" in (tmp_path / "run" / "events.jsonl").read_text()
+
+
+def test_a_refused_run_is_the_unguided_one(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    prior.answer = lambda x_t, a, c: 2 * c.render[:3] - 1  # knows nothing more
+    bands = OptimizerConfig(sh_degree_every=9)
+    train(replace(config(dataset, guard_views=1, guard_steps=20), optimizer=bands), tmp_path / "run")
+    assert guard_of(tmp_path / "run")["factor"] == 0
+    train(tiny_config(dataset, optimizer=bands), tmp_path / "plain")
+    guided, plain = ((tmp_path / name / "splat.ply").read_bytes() for name in ("run", "plain"))
+    assert guided == plain
 
 
 def guard_of(run: Path) -> dict:

@@ -1,4 +1,4 @@
-// One Adam step in place (Kingma & Ba 2015), a thousand Gaussians at a time, all their numbers.
+// One Adam step in place (Kingma & Ba 2015): some thousand Gaussians at a time, all their numbers.
 #pragma once
 #include "frame.h"
 #include "parallel.h"
@@ -24,24 +24,15 @@ inline void adam_span(const AdamArguments& a, const AdamParameter& of, int64_t b
   }
 }
 
-// shN of n <= kWide Gaussians from `first` on. The gradient of one frame is an outer product that no one wrote down:
-// dLoss/d(shN row) = Y(direction of view) ⊗ dLoss/d(sh0) / Y_0. `rows` has room for it and zeros where no band is drawn.
+// shN of n <= kWide Gaussians from `first` on, whose gradient no one wrote down. `rows` has room for it and zeros where no band is
+// drawn.
 inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t first, int n, float* rows) {
   const int bands = (a.sh_degree + 1) * (a.sh_degree + 1) - 1;
   alignas(64) float mean[3][kWide] = {}, Y[15][kWide];
   for (int l = 0; l < n; ++l)
     for (int k = 0; k < 3; ++k) mean[k][l] = a.means[3 * (first + l) + k];
-  wide inverse_distance, basis[15];
-  const Vec3<wide> at = {load_wide(mean[0]), load_wide(mean[1]), load_wide(mean[2])};
-  const Vec3<wide> d = view_directions(a.camera, at - splat3<wide>(a.camera.pivot), inverse_distance);
-  sh_basis(a.sh_degree, d.x, d.y, d.z, basis);
-  for (int k = 0; k < bands; ++k) store_wide(Y[k], basis[k]);
-  for (int l = 0; l < n; ++l) {
-    const float* v = a.v_sh0 + 3 * (first + l);
-    const f4 v_color = f4{v[0], v[1], v[2], 0.f} * (1.f / kSH0);
-    // The fourth lane is overwritten by the next coefficient.
-    for (int k = 0; k < bands; ++k) store4(rows + l * of.stride + 3 * k, v_color * Y[k][l]);
-  }
+  view_basis(a.camera, {load_wide(mean[0]), load_wide(mean[1]), load_wide(mean[2])}, a.sh_degree, Y);
+  for (int l = 0; l < n; ++l) bands_gradient(a.v_sh0, first + l, bands, Y, l, rows + l * of.stride);
   adam_span(a, of, first * of.stride, n * of.stride, rows);
 }
 

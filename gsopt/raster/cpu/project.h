@@ -31,6 +31,14 @@ template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<
   return d * inverse_distance;
 }
 
+// The bands at the directions in which a vector of Gaussians is seen. Not inlined: all who ask must get the same bits.
+[[gnu::noinline]] inline void view_basis(const Camera& cam, const Vec3<wide>& mean, int degree, float Y[15][kWide]) {
+  wide basis[15], inverse_distance;
+  const Vec3<wide> d = view_directions(cam, mean - splat3<wide>(cam.pivot), inverse_distance);
+  sh_basis(degree, d.x, d.y, d.z, basis);
+  for (int k = 0; k < (degree + 1) * (degree + 1) - 1; ++k) store_wide(Y[k], basis[k]);
+}
+
 // Calls visit(k, (r, g, b, anything)) for the first `bands` coefficients of row n of shN. Four floats are read for each, but for the
 // last of a row, behind which there may be nothing.
 template <class Visit> inline void for_each_band(const Parameters& P, int64_t n, int bands, Visit&& visit) {
@@ -40,7 +48,7 @@ template <class Visit> inline void for_each_band(const Parameters& P, int64_t n,
   for (int k = safe > 0 ? safe : 0; k < bands; ++k) visit(k, f4{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2], 0.f});
 }
 
-// Bands of a Gaussian that is needed soon: a page of memory ends every twenty of them, and no processor looks beyond.
+// Bands of a Gaussian that is needed soon: a page of memory ends every twenty of them, where processors stop to look ahead.
 inline void prefetch_bands(const Parameters& P, int64_t n) {
   const float* row = P.shN + 3 * P.sh_rest * (n + kBandsAhead < P.count ? n + kBandsAhead : n);
   for (int k = 0; k < 3 * P.sh_rest; k += 16) __builtin_prefetch(row + k);
@@ -81,10 +89,7 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   alignas(64) float Y[15][kWide], out[10][kWide], rad[2][kWide];
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   if (mask) {
-    wide basis[15], inv;
-    const Vec3<wide> d = view_directions(cam, p.offset, inv);
-    sh_basis(frame.sh_degree, d.x, d.y, d.z, basis);
-    for (int b = 0; b < bands; ++b) store_wide(Y[b], basis[b]);
+    view_basis(cam, g.mean, frame.sh_degree, Y);
     const wide fields[8] = {p.mx, p.my, A, B, C, lo, p.t.z, p.t.z};
     for (int f = 0; f < 7; ++f) store_wide(out[f], fields[f]);
     store_wide(rad[0], rx), store_wide(rad[1], ry);
@@ -148,20 +153,23 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
   covers[P.count].slot = static_cast<uint32_t>(frame.intersections);
 }
 
-// dLoss/d(shN row) = Y ⊗ dLoss/dcolor, where there is room for it; returns dLoss/d(direction) before normalisation.
-inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (*Y)[kWide], const float (*Yx)[kWide],
-                        const float (*Yy)[kWide], const float (*Yz)[kWide], int lane, const float* v_color, float* v_sh,
-                        float* v_direction) {
+// dLoss/d(direction), before normalisation.
+inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (*Yx)[kWide], const float (*Yy)[kWide],
+                        const float (*Yz)[kWide], int lane, const float* v_color, float* v_direction) {
   const f4 v = {v_color[0], v_color[1], v_color[2], 0.f};
   f4 dx = splat<f4>(0.f), dy = dx, dz = dx;
   for_each_band(P, n, bands, [&](int k, f4 sh) { dx += sh * Yx[k][lane], dy += sh * Yy[k][lane], dz += sh * Yz[k][lane]; });
   v_direction[0] = dx[0] * v[0] + dx[1] * v[1] + dx[2] * v[2];
   v_direction[1] = dy[0] * v[0] + dy[1] * v[1] + dy[2] * v[2];
   v_direction[2] = dz[0] * v[0] + dz[1] * v[1] + dz[2] * v[2];
-  if (!v_sh) return;
-  for (int k = 0; k < bands; ++k)
-    for (int ch = 0; ch < 3; ++ch) v_sh[3 * k + ch] = v[ch] * Y[k][lane];
-  for (int k = 3 * bands; k < 3 * P.sh_rest; ++k) v_sh[k] = 0.f;
+}
+
+// Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 at `row`, but for bands that are not drawn. Writes one float more, which is the
+// next row's or spare.
+inline void bands_gradient(const float* v_sh0, int64_t n, int bands, const float (*Y)[kWide], int lane, float* row) {
+  const float* v = v_sh0 + 3 * n;
+  const f4 v_color = f4{v[0], v[1], v[2], 0.f} * (1.f / kSH0);
+  for (int k = 0; k < bands; ++k) store4(row + 3 * k, v_color * Y[k][lane]);
 }
 
 // The rows of one splat, summed in slot order; false when all are zero, or there are none: no pixel saw it.
@@ -191,13 +199,13 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
                                L.A * su, L.B * su + L.C * sv, field[kWz]};
   Splat3D<wide> out = project_backward(cam, p, L, v);
 
-  wide basis[15], bx[15], by[15], bz[15], inv;
+  wide bx[15], by[15], bz[15], inv;
   alignas(64) float Y[15][kWide], Yx[15][kWide], Yy[15][kWide], Yz[15][kWide];
   const Vec3<wide> d = view_directions(cam, p.offset, inv);
   const int degree = frame.sh_degree, bands = (degree + 1) * (degree + 1) - 1;
-  sh_basis(degree, d.x, d.y, d.z, basis);
+  if (G.shN) view_basis(cam, g.mean, degree, Y);
   sh_basis_gradient(degree, d.x, d.y, d.z, bx, by, bz);
-  for (int k = 0; k < bands; ++k) store_wide(Y[k], basis[k]), store_wide(Yx[k], bx[k]), store_wide(Yy[k], by[k]), store_wide(Yz[k], bz[k]);
+  for (int k = 0; k < bands; ++k) store_wide(Yx[k], bx[k]), store_wide(Yy[k], by[k]), store_wide(Yz[k], bz[k]);
   alignas(64) float vd[3][kWide] = {};
   for (int l = 0; l < lanes; ++l) {
     const int64_t n = index[l];
@@ -205,7 +213,12 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
     float direction[3];
     const float color[3] = {r.r > 0.f ? sums[l][kWr] : 0.f, r.g > 0.f ? sums[l][kWg] : 0.f, r.b > 0.f ? sums[l][kWb] : 0.f};
     for (int ch = 0; ch < 3; ++ch) G.sh0[3 * n + ch] = color[ch] * kSH0;
-    sh_backward(P, n, bands, Y, Yx, Yy, Yz, l, color, G.shN ? G.shN + 3 * P.sh_rest * n : nullptr, direction);
+    sh_backward(P, n, bands, Yx, Yy, Yz, l, color, direction);
+    if (G.shN) {
+      float row[3 * kMaxBands + 1] = {};
+      bands_gradient(G.sh0, n, bands, Y, l, row);
+      std::memcpy(G.shN + 3 * P.sh_rest * n, row, sizeof(float) * 3 * P.sh_rest);
+    }
     for (int a3 = 0; a3 < 3; ++a3) vd[a3][l] = direction[a3];
   }
   Vec3<wide> u = {load_wide(vd[0]), load_wide(vd[1]), load_wide(vd[2])};
