@@ -1,11 +1,12 @@
 """What guidance changes on objects no prior was trained on: the same run without it and with it, held-out metrics.
 
-    python benchmarks/guidance.py SCENES... -o FILE.json [--arm off default ...] [--views 4 6 8] [--seeds 3]
+    python benchmarks/guidance.py SCENES... [-o FILE.json] [--arm off default ...] [--views 4 6 8] [--seeds 3]
                                   [--prior PRIOR] [--iterations 2000] [--draw]
 
 SCENES are posed scenes with held-out views, or folders of them. Every arm is one run from the same first Gaussians with
 the same steps; runs that have a record in FILE are not made again. The table pairs every arm with `off`, object by
-object. --draw prints it from FILE without running anything.
+object: the mean over objects and seeds, and the standard error over objects, whose seeds are averaged first. --draw
+writes it from FILE into docs/howto/guidance.md without running anything.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.machine import machine
 from gsopt.cli import main as gsopt
 from gsopt.events import to_json, write_atomic
@@ -32,7 +34,16 @@ ARMS: dict[str, list[str]] = {
     "sds, words": [*SDS, "--guidance.references", "0", "--guidance.image-weight", "0"],
 }
 """All but `default` without the guard. `words`: no input view is shown, but the object's name is told."""
+NAMES = {
+    "off": "unguided",
+    "default": "default",
+    "recon": "recon, what is taken by itself",
+    "sds": "SDS that sees the input views",
+    "sds, words": "SDS that is told the object's name, no views",
+}
 METRICS = ("psnr", "ssim", "lpips_alex")
+PAGE = Path(__file__).parents[1] / "docs" / "howto" / "guidance.md"
+RESULT = Path(__file__).parent / "results" / "guidance.json"
 
 
 def scenes(roots: list[Path]) -> list[Path]:
@@ -55,7 +66,6 @@ def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespac
     if code:
         raise SystemExit(f"{scene.name}, {views} views, {arm}: gsopt train ended with {code}")
     metrics = json.loads((folder / "metrics.json").read_text())
-    guidance = json.loads((folder / "config.json").read_text()).get("guidance", {})
     summary = folder / "guidance" / "summary.json"
     return {
         "scene": scene.name,
@@ -66,7 +76,6 @@ def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespac
         **{name: metrics["mean"][name] for name in METRICS},
         "cpu_seconds": round(time.process_time() - began, 1),
         "n_gaussians": metrics["n_gaussians"],
-        "settings": guidance,
         "guidance": json.loads(summary.read_text()) if summary.exists() else None,
     }
 
@@ -76,39 +85,41 @@ def key(record: dict[str, Any]) -> str:
 
 
 def draw(records: list[dict[str, Any]]) -> str:
-    """Markdown: every arm against `off`, by number of input views; mean difference, its standard error, the worst."""
+    """Markdown: every arm against `off`, by number of input views."""
     off = {(r["scene"], r["views"], r["seed"]): r for r in records if r["arm"] == "off"}
-    lines = [
-        "| views | arm | runs | PSNR | ΔPSNR | worst ΔPSNR | SSIM | ΔSSIM | LPIPS | ΔLPIPS | CPU s |",
-        "|---" * 11 + "|",
-    ]
+    rows = []
     for views in sorted({r["views"] for r in records}):
         for arm in dict.fromkeys(r["arm"] for r in records):
-            rows = [r for r in records if r["views"] == views and r["arm"] == arm]
-            pairs = [(r, off[r["scene"], r["views"], r["seed"]]) for r in rows if (r["scene"], views, r["seed"]) in off]
+            mine = [r for r in records if r["views"] == views and r["arm"] == arm]
+            pairs = [(r, off[r["scene"], views, r["seed"]]) for r in mine if (r["scene"], views, r["seed"]) in off]
             if not pairs:
                 continue
-            cells = [f"{views}", arm, f"{len(pairs)}"]
-            for name in METRICS:
-                change = [a[name] - b[name] for a, b in pairs]
-                mean = sum(change) / len(change)
-                error = math.sqrt(sum((c - mean) ** 2 for c in change) / max(1, len(change) - 1) / len(change))
-                digits = 2 if name == "psnr" else 4
-                cells += [
-                    f"{sum(a[name] for a, _ in pairs) / len(pairs):.{digits}f}",
-                    f"{mean:+.{digits}f} ± {error:.{digits}f}",
-                ]
-                if name == "psnr":
-                    cells.append(f"{min(change):+.2f}")
-            cells.append(f"{sum(a['cpu_seconds'] for a, _ in pairs) / len(pairs):.0f}")
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            seconds = sum(a["cpu_seconds"] for a, _ in pairs) / len(pairs)
+            if arm == "off":
+                level = {name: sum(a[name] for a, _ in pairs) / len(pairs) for name in METRICS}
+                cells = [f"{level['psnr']:.2f} dB", "", f"{level['ssim']:.4f}", f"{level['lpips_alex']:.4f}"]
+            else:
+                (psnr, worst), (ssim, _), (lpips, _) = (changed(pairs, name) for name in METRICS)
+                cells = [psnr, f"{worst:+.2f}", ssim, lpips]
+            rows.append([f"{views}", NAMES[arm], f"{len(pairs)}", *cells, f"{seconds:.0f}"])
+    return table(["views", "arm", "runs", "ΔPSNR, dB", "worst run", "ΔSSIM", "ΔLPIPS Alex", "CPU s"], rows)
+
+
+def changed(pairs: list[tuple[dict[str, Any], dict[str, Any]]], name: str) -> tuple[str, float]:
+    """Mean and standard error over objects of a metric's change, and the lowest of a run."""
+    digits = 2 if name == "psnr" else 4
+    scenes = {a["scene"] for a, _ in pairs}
+    by_scene = [[a[name] - b[name] for a, b in pairs if a["scene"] == scene] for scene in sorted(scenes)]
+    change = [sum(values) / len(values) for values in by_scene]
+    mean = sum(change) / len(change)
+    error = math.sqrt(sum((c - mean) ** 2 for c in change) / max(1, len(change) - 1) / len(change))
+    return f"{mean:+.{digits}f} ± {error:.{digits}f}", min(min(values) for values in by_scene)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="*")
-    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("-o", "--out", type=Path, default=RESULT)
     parser.add_argument("--arm", nargs="*", choices=list(ARMS), default=["off", "default"])
     parser.add_argument("--views", type=int, nargs="*", default=[4, 6, 8])
     parser.add_argument("--seeds", type=int, default=3)
@@ -117,6 +128,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/guidance"))
     parser.add_argument("--draw", action="store_true")
     options = parser.parse_args()
+    document: dict[str, Any]
     document = json.loads(options.out.read_text()) if options.out.exists() else {"machine": machine(), "runs": []}
     known = {key(record): record for record in document["runs"]}
     for seed in range(0 if options.draw else options.seeds):
@@ -130,6 +142,8 @@ def main() -> None:
                     known[name] = run(scene, views, seed, arm, options, options.runs / name.replace(" ", "_"))
                     write_atomic(options.out, to_json({**document, "runs": list(known.values())}))
     print(draw(list(known.values())))
+    if options.draw:
+        replace_block(PAGE, "guidance", draw(list(known.values())))
 
 
 if __name__ == "__main__":
