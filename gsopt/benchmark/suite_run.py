@@ -17,7 +17,7 @@ from typing import Any
 from gsopt.benchmark import suite_arms, suite_key
 from gsopt.benchmark.suite import LOOKS, Case
 from gsopt.benchmark.suite_file import METRICS
-from gsopt.config import DataConfig, SparseConfig
+from gsopt.config import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import GsoptError, InputError
 from gsopt.evaluation import read_metrics
@@ -60,8 +60,7 @@ def reason_to_skip(case: Case, bench: Bench) -> str | None:
     choice = choose(config)
     if choice.prior is not None and not bench.prior:
         views = load_scene(data_config(case, bench.root))
-        few = SparseConfig().below_views
-        choice = fitting(choice, config, len(views.train), few, views.has_alpha)
+        choice = fitting(choice, config, len(views.train), views.has_alpha)
     if choice.prior is None:
         return f"the same as ours-0, not guided: {choice.reason}"
     if case.arm not in suite_arms.WORDS:

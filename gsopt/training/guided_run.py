@@ -28,8 +28,7 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
     """
     recorded = directory.recorded("guidance")
     if recorded is None:
-        few = config.sparse.below_views
-        choice = fitting(choose(config.guidance), config.guidance, len(scene.train), few, scene.has_alpha)
+        choice = fitting(choose(config.guidance), config.guidance, len(scene.train), scene.has_alpha)
         recorded = {"prior": choice.prior, "lambda_sds": choice.weight, "reason": choice.reason}
         if choice.prior is None:
             directory.record(guidance=recorded)

@@ -53,11 +53,18 @@ def test_it_is_the_default_and_answers_the_same_bits_each_time() -> None:
 
 @pytest.mark.parametrize(
     ("views", "has_alpha", "said", "guided"),
-    [(4, True, {}, True), (40, True, {}, False), (4, False, {}, False), (40, False, {"lambda_sds": 0.2}, True)],
+    [
+        (4, True, {}, True),
+        (5, True, {}, True),
+        (6, True, {}, False),
+        (6, True, {"prompt": ("a chair",)}, True),
+        (4, False, {}, False),
+        (40, False, {"lambda_sds": 0.2}, True),
+    ],
 )
 def test_it_guides_few_views_of_cut_out_objects_or_where_it_was_asked_for(views, has_alpha, said, guided) -> None:
-    found = fitting(DEFAULT, GuidanceConfig(**said), views, 16, has_alpha)
+    found = fitting(DEFAULT, GuidanceConfig(**said), views, has_alpha)
     assert (found.prior == "embedded") == guided
     assert guided or found.weight == 0
     other = Choice("sd21", 0.2, "as asked for with --prior")
-    assert fitting(other, GuidanceConfig(prior="sd21"), views, 16, has_alpha) == other
+    assert fitting(other, GuidanceConfig(prior="sd21"), views, has_alpha) == other
