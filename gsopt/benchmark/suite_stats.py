@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from gsopt.benchmark import suite_arms
+
 CONFIDENCE = 0.95
 
 Run = Mapping[str, Any]
@@ -119,6 +121,13 @@ def mean_curve(runs: Sequence[Run], metric: str) -> list[tuple[float, float]]:
             seconds = statistics.fmean(look["cpu_seconds"] for look in looks)
             points.append((seconds, statistics.fmean(look[metric] for look in looks)))
     return points
+
+
+def complete(runs: Sequence[Run], ways: Sequence[Way]) -> list[Way]:
+    """`ways` without arms of words that lack a scene or seed: of some a language model has nothing to say."""
+    made = {one: {(run["scene"], run["seed"]) for run in runs if way(run) == one} for one in ways}
+    every = set().union(*made.values())
+    return [one for one in ways if one[0] not in suite_arms.WORDS or made[one] == every]
 
 
 def common(runs: Sequence[Run], ways: Sequence[Way]) -> list[Run]:

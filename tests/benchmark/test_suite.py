@@ -295,6 +295,18 @@ def test_arms_are_averaged_over_what_all_of_them_have(tmp_path: Path) -> None:
     assert "| 3dgs, 2,000 | 1 | 20.00 |" in text
 
 
+def test_an_arm_that_lacks_scenes_does_not_narrow_the_others() -> None:
+    runs = [
+        record(arm, 20.0 + i, scene) for i, arm in enumerate(("3dgs", "ours-0")) for scene in ("objects/a", "objects/b")
+    ]
+    runs.append(record("ours-llm", 30.0, "objects/b"))
+    made = suite_page.part(suite.load("sparse"), suite.load("sparse").groups[0], "4", runs)
+    note, (_, rows) = made.tables[0]
+    assert [row[:3] for row in rows] == [["3dgs, 2,000", "2", "20.00"], ["ours-0, 2,000", "2", "21.00"]]
+    assert "ours-llm" in note
+    assert any(row[0].startswith("ours-llm, 2,000 less") and row[1] == "1" for row in made.tables[1][1][1])
+
+
 def test_rows_of_scenes_are_of_the_seeds_that_all_arms_have(tmp_path: Path) -> None:
     """Else two arms of the same bits would seem to differ, because one of them has a second seed."""
     page = page_of(

@@ -37,12 +37,13 @@ inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t 
 }
 
 inline void adam_stage(Pool& pool, const AdamArguments& a) {
-  const int64_t fair = a.count / (4 * pool.threads()), kRows = fair < 256 ? 256 : (fair > 16384 ? 16384 : fair);
-  parallel(pool, divide_up(a.count, kRows), [&](int chunk, int) {
-    const int64_t begin = chunk * kRows, end = begin + kRows < a.count ? begin + kRows : a.count;
+  // A multiple of every vector's width: only the last numbers of all are stepped one by one, however many threads there are.
+  const int64_t fair = a.count / (4 * pool.threads()) / 256 * 256, rows = fair < 256 ? 256 : (fair > 16384 ? 16384 : fair);
+  parallel(pool, divide_up(a.count, rows), [&](int chunk, int) {
+    const int64_t begin = chunk * rows, end = begin + rows < a.count ? begin + rows : a.count;
     if (a.bands.param) {  // first, while the means are those that were drawn
-      alignas(64) float rows[kWide * kMaxBands * 3 + 1] = {};
-      for (int64_t i = begin; i < end; i += kWide) adam_bands(a, a.bands, i, end - i < kWide ? static_cast<int>(end - i) : kWide, rows);
+      alignas(64) float gradient[kWide * kMaxBands * 3 + 1] = {};
+      for (int64_t i = begin; i < end; i += kWide) adam_bands(a, a.bands, i, end - i < kWide ? static_cast<int>(end - i) : kWide, gradient);
     }
     for (const AdamParameter& of : a.others)
       if (of.param) adam_span(a, of, begin * of.stride, (end - begin) * of.stride, of.grad + begin * of.stride);

@@ -159,9 +159,8 @@ inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (
   const f4 v = {v_color[0], v_color[1], v_color[2], 0.f};
   f4 dx = splat<f4>(0.f), dy = dx, dz = dx;
   for_each_band(P, n, bands, [&](int k, f4 sh) { dx += sh * Yx[k][lane], dy += sh * Yy[k][lane], dz += sh * Yz[k][lane]; });
-  v_direction[0] = dx[0] * v[0] + dx[1] * v[1] + dx[2] * v[2];
-  v_direction[1] = dy[0] * v[0] + dy[1] * v[1] + dy[2] * v[2];
-  v_direction[2] = dz[0] * v[0] + dz[1] * v[1] + dz[2] * v[2];
+  dx *= v, dy *= v, dz *= v;
+  v_direction[0] = dx[0] + dx[1] + dx[2], v_direction[1] = dy[0] + dy[1] + dy[2], v_direction[2] = dz[0] + dz[1] + dz[2];
 }
 
 // Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 at `row`, but for bands that are not drawn. Writes one float more, which is the
@@ -183,8 +182,9 @@ inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
   return any(nonzero);
 }
 
+// A full vector, always: a compiler that knew how many lanes count would round otherwise for whole vectors than for the last one.
 inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kWide],
-                                   const float sums[kWide][kRow], int lanes) {
+                                   const float sums[kWide][kRow]) {
   const Camera& cam = frame.camera;
   const Record* records = frame.records.as<Record>();
   wide field[kRow];
@@ -207,7 +207,7 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   sh_basis_gradient(degree, d.x, d.y, d.z, bx, by, bz);
   for (int k = 0; k < bands; ++k) store_wide(Yx[k], bx[k]), store_wide(Yy[k], by[k]), store_wide(Yz[k], bz[k]);
   alignas(64) float vd[3][kWide] = {};
-  for (int l = 0; l < lanes; ++l) {
+  for (int l = 0; l < kWide; ++l) {
     const int64_t n = index[l];
     const Record& r = records[n];
     float direction[3];
@@ -229,7 +229,7 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
                           out.log_scale.y, out.log_scale.z, out.logit, v.mx, v.my, field[kAbsX], field[kAbsY]};
   alignas(64) float t[15][kWide];
   for (int k = 0; k < 15; ++k) store_wide(t[k], results[k]);
-  for (int l = 0; l < lanes; ++l) {
+  for (int l = 0; l < kWide; ++l) {
     const int64_t n = index[l];
     for (int k = 0; k < 3; ++k) G.means[3 * n + k] = t[k][l], G.log_scales[3 * n + k] = t[7 + k][l];
     for (int k = 0; k < 4; ++k) G.quats[4 * n + k] = t[3 + k][l];
@@ -265,11 +265,11 @@ inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P
       }
       prefetch_bands(P, n);
       index[lanes++] = n;
-      if (lanes == kWide) project_backward_lanes(frame, P, G, index, sums, lanes), lanes = 0;
+      if (lanes == kWide) project_backward_lanes(frame, P, G, index, sums), lanes = 0;
     }
     if (lanes) {
-      for (int l = lanes; l < kWide; ++l) index[l] = index[0];
-      project_backward_lanes(frame, P, G, index, sums, lanes);
+      for (int l = lanes; l < kWide; ++l) index[l] = index[0], std::memcpy(sums[l], sums[0], sizeof(sums[0]));
+      project_backward_lanes(frame, P, G, index, sums);
     }
   });
 }
