@@ -67,12 +67,12 @@ def part(suite: Suite, group: Group, views: str, runs: list[Run]) -> Part:
     seeds = sorted({run["seed"] for run in runs})
     which = ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
     made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, {which}.")
-    wide = suite_stats.complete(runs, ways)
-    same = suite_stats.common(runs, wide)
+    whole = suite_stats.complete(runs, ways)
+    same = suite_stats.common(runs, whole)
     note = "Means over scenes, seeds averaged first; " + ("what every arm has." if same else "arms differ in scenes.")
-    if lacking := [_name(one) for one in ways if one not in wide] if same else []:
+    if lacking := [_name(one) for one in ways if one not in whole] if same else []:
         note += f" Not of {', '.join(lacking)}, where scenes or seeds are missing."
-    made.tables.append((note, figures(same or runs, wide if same else ways)))
+    made.tables.append((note, figures(same or runs, whole if same else ways)))
     pairs = list(comparisons(group, ways))
     if rows := [row for a, b in pairs if (row := compared(runs, a, b))]:
         what = "scenes" if len(made.scenes) > 1 else "seeds of the one scene"
@@ -167,14 +167,14 @@ def scene_rows(runs: Sequence[Run], scenes: Sequence[str], ways: Sequence[Way]) 
 
 def charts(stem: str, made: Part, runs: Sequence[Run]) -> dict[str, str]:
     """Quality over CPU seconds of the arms that lack no scene, over the scenes and seeds that all of these have."""
-    wide = suite_stats.complete(runs, made.ways)
-    same = suite_stats.common(runs, wide)
+    whole = suite_stats.complete(runs, made.ways)
+    same = suite_stats.common(runs, whole)
     if not same:
         return {}
     drawn = {}
     for metric, label in (("psnr", "PSNR, dB"), ("lpips_alex", "LPIPS (Alex), lower is better")):
         series = [
-            Series(_name(one), suite_stats.mean_curve([r for r in same if way(r) == one], metric)) for one in wide
+            Series(_name(one), suite_stats.mean_curve([r for r in same if way(r) == one], metric)) for one in whole
         ]
         title = f"{made.title} ({_count(len({run['scene'] for run in same}), 'scene')})"
         drawn[f"{stem}-{metric.partition('_')[0]}"] = chart(title, Axis("CPU seconds"), Axis(label), series)

@@ -104,7 +104,7 @@ struct Model {
 Parameters parameters_of(const Model& m, int sh_degree) {
   const size_t n = m.logit_opacities.size();
   const int rest = n ? static_cast<int>(m.shN.size() / (3 * n)) : 0;
-  if (rest > kMaxBands) throw std::invalid_argument("shN holds more than three bands");
+  if (rest > kMaxBands) throw std::invalid_argument("shN holds more than the bands of degree 3");
   if ((sh_degree + 1) * (sh_degree + 1) - 1 > rest && n) throw std::invalid_argument("shN holds fewer bands than sh_degree asks for");
   return {static_cast<int64_t>(n),
           sh_degree,
