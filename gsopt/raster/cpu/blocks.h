@@ -39,7 +39,7 @@ inline void find_touched(const Local& local, int n, uint32_t alive, bool every, 
   int32_t* blocks = reinterpret_cast<int32_t*>(touched.blocks);
   for (int i = 0; i < n; i += kWide) {
     wide v[8];
-    load_columns(&local.row[i].x, 8, v);
+    load_eights([&](int l) { return load8(&local.row[i + l].x); }, v);
     store_widei(blocks + i, every ? splat_widei(-1) : block_masks(v[2], v[3], v[4], v[5], v[0], v[1]));
     store_wide(touched.u0 + i, zero - (v[2] * v[0] + v[3] * v[1])), store_wide(touched.v0 + i, zero - v[4] * v[1]);
   }

@@ -12,6 +12,7 @@ namespace gsopt {
 constexpr int kTile = 16;         // pixels along a tile's side
 constexpr int kChunk = 256;       // splats of a tile that are worked on at once
 constexpr int kProjectChunk = 1024;
+constexpr int kLargestVector = 16;  // lanes, of any instruction set
 
 // Grows, never shrinks, 64-byte aligned; contents are lost when it grows.
 class Buffer {

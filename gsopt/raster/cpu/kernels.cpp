@@ -10,7 +10,7 @@
 #include "calibrate.h"
 #include "match.h"
 #include "photometric.h"
-#include "project.h"
+#include "project_backward.h"
 
 #define GSOPT_STRING_(x) #x
 #define GSOPT_STRING(x) GSOPT_STRING_(x)

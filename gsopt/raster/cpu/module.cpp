@@ -147,7 +147,7 @@ Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, i
 }
 
 void reserve_frame(Frame& f, int64_t n) {
-  f.records.reserve(sizeof(Record) * (n + 1));
+  f.records.reserve(sizeof(Record) * (n + kLargestVector));  // the last vector is written in full
   for (Buffer* b : {&f.keys, &f.order, &f.keys2, &f.order2}) b->reserve(sizeof(uint32_t) * (n + kProjectChunk));
   f.covers.reserve(sizeof(Cover) * (n + 1));
   f.found.reserve(sizeof(Found) * (n / kProjectChunk + 1));

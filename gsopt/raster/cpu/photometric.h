@@ -49,6 +49,17 @@ struct Image {
   float* at(int y, int x) const { return data + (y & (rows - 1)) * stride + (x - x0); }
 };
 
+// The sum of the vectors `Shift` floats before and behind `center`.
+template <int Shift> inline wide both_sides(const float* center) {
+#if defined(__AVX512F__)
+  // Out of whole lines of the cache: loads that lie in two cost twice.
+  const auto before = (__m512i)load_wide(center - kWide), here = (__m512i)load_wide(center), behind = (__m512i)load_wide(center + kWide);
+  return (wide)_mm512_alignr_epi32(here, before, kWide - Shift) + (wide)_mm512_alignr_epi32(behind, here, Shift);
+#else
+  return load_wide(center - Shift) + load_wide(center + Shift);
+#endif
+}
+
 // Two rows of `Maps` images filtered down the columns, for a strip and kHalo floats on either side; zeros outside.
 template <int Maps> class Columns {
  public:
@@ -78,9 +89,8 @@ template <int Maps> class Columns {
   // Along one of the two rows, at float i of the strip.
   wide filter(int row, int map, int i) const {
     const float* center = &data[row][map][kPad + i];
-    wide sum = load_wide(center) * kWindow[0];
-    for (int k = 1; k <= kRadius; ++k) sum += (load_wide(center - 3 * k) + load_wide(center + 3 * k)) * kWindow[k];
-    return sum;
+    const wide sum = load_wide(center) * kWindow[0] + both_sides<3>(center) * kWindow[1] + both_sides<6>(center) * kWindow[2];
+    return sum + both_sides<9>(center) * kWindow[3] + both_sides<12>(center) * kWindow[4] + both_sides<15>(center) * kWindow[5];
   }
 
  private:

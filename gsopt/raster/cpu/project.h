@@ -1,28 +1,36 @@
-// Stage 1 and its mirror image: Gaussians to splats, a vector at a time, and gradients of splats to gradients of Gaussians.
+// Stage 1: Gaussians to splats, a vector at a time.
 #pragma once
 #include "../common/sh.h"
+#include "columns.h"
 #include "frame.h"
 #include "parallel.h"
 #include "tiles.h"
 
 namespace gsopt::GSOPT_ISA {
 
-constexpr int kBandsAhead = 32;
+// Gaussians are visited in their order, but in more arrays than a processor foresees: what this many further on will be read or
+// written is asked for. It may lie behind an array's end, where asking does no harm.
+constexpr int kGaussiansAhead = 24;
 
-// A vector of Gaussians from arrays of structures to one vector per field. `rows` may repeat an index: the tail is padded.
-inline Splat3D<wide> load_splats(const Parameters& P, const int64_t rows[kWide]) {
-  alignas(64) float v[11][kWide];
-  for (int l = 0; l < kWide; ++l) {
-    const int64_t n = rows[l];
-    const float *m = P.means + 3 * n, *q = P.quats + 4 * n, *s = P.log_scales + 3 * n;
-    v[0][l] = m[0], v[1][l] = m[1], v[2][l] = m[2];
-    v[3][l] = q[0], v[4][l] = q[1], v[5][l] = q[2], v[6][l] = q[3];
-    v[7][l] = s[0], v[8][l] = s[1], v[9][l] = s[2];
-    v[10][l] = P.logit_opacities[n];
-  }
-  wide f[11];
-  for (int k = 0; k < 11; ++k) f[k] = load_wide(v[k]);
-  return {{f[0], f[1], f[2]}, f[3], f[4], f[5], f[6], {f[7], f[8], f[9]}, f[10]};
+// Three numbers of row n, and anything: four are read, but for the last of all rows, behind which there may be nothing.
+inline f4 load_three(const float* rows, int64_t n, int64_t count) {
+  const float* p = rows + 3 * n;
+  return n + 1 < count ? load4(p) : f4{p[0], p[1], p[2], 0.f};
+}
+
+// Rows of three numbers of a vector of Gaussians; `index` may repeat one: the tail is padded.
+inline Vec3<wide> load_vec3(const float* rows, const int64_t index[kWide], int64_t count) {
+  wide v[4];
+  load_fours([&](int l) { return load_three(rows, index[l], count); }, v);
+  return {v[0], v[1], v[2]};
+}
+
+inline Splat3D<wide> load_splats(const Parameters& P, const int64_t index[kWide]) {
+  alignas(64) float logits[kWide];
+  for (int l = 0; l < kWide; ++l) logits[l] = P.logit_opacities[index[l]];
+  wide q[4];
+  load_fours([&](int l) { return load4(P.quats + 4 * index[l]); }, q);
+  return {load_vec3(P.means, index, P.count), q[0], q[1], q[2], q[3], load_vec3(P.log_scales, index, P.count), load_wide(logits)};
 }
 
 template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<F>& offset, F& inverse_distance) {
@@ -39,26 +47,32 @@ template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<
   for (int k = 0; k < (degree + 1) * (degree + 1) - 1; ++k) store_wide(Y[k], basis[k]);
 }
 
-// Calls visit(k, (r, g, b, anything)) for the first `bands` coefficients of row n of shN. Four floats are read for each, but for the
-// last of a row, behind which there may be nothing.
-template <class Visit> inline void for_each_band(const Parameters& P, int64_t n, int bands, Visit&& visit) {
-  const float* sh = P.shN + 3 * P.sh_rest * n;
-  const int safe = bands < P.sh_rest ? bands : bands - 1;
-  for (int k = 0; k < safe; ++k) visit(k, load4(sh + 3 * k));
-  for (int k = safe > 0 ? safe : 0; k < bands; ++k) visit(k, f4{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2], 0.f});
+// The first `bands` coefficients of shN of a vector of Gaussians: red, green and blue of one band after the other. The last eight
+// numbers are read from the end of a row, so that nothing behind it is.
+inline void load_bands(const Parameters& P, const int64_t index[kWide], int bands, wide sh[3 * kMaxBands + 3]) {
+  const int stride = 3 * P.sh_rest;
+  for (int from = 0; from < 3 * bands; from += 8) {
+    const int at = from + 8 <= stride ? from : stride - 8;
+    const auto row = [&](int l) {
+      const float* p = P.shN + stride * index[l] + at;
+      __builtin_prefetch(p + stride * kGaussiansAhead);
+      return load8(p);
+    };
+    load_eights(row, sh + at);
+  }
 }
 
-// Bands of a Gaussian that is needed soon: a page of memory ends every twenty of them, where processors stop to look ahead.
-inline void prefetch_bands(const Parameters& P, int64_t n) {
-  const float* row = P.shN + 3 * P.sh_rest * (n + kBandsAhead < P.count ? n + kBandsAhead : n);
-  for (int k = 0; k < 3 * P.sh_rest; k += 16) __builtin_prefetch(row + k);
-}
-
-inline f4 sh_color(const Parameters& P, int64_t n, const float Y[][kWide], int lane, int bands) {
-  const float* dc = P.sh0 + 3 * n;
-  f4 c = f4{dc[0], dc[1], dc[2], 0.f} * kSH0 + 0.5f;
-  for_each_band(P, n, bands, [&](int k, f4 sh) { c += sh * Y[k][lane]; });
-  return c;
+inline Vec3<wide> sh_color(const Frame& frame, const Parameters& P, const int64_t index[kWide], const Vec3<wide>& mean) {
+  const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
+  alignas(64) float Y[kMaxBands][kWide];
+  wide sh[3 * kMaxBands + 3];
+  view_basis(frame.camera, mean, frame.sh_degree, Y);
+  load_bands(P, index, bands, sh);
+  const Vec3<wide> dc = load_vec3(P.sh0, index, P.count);
+  Vec3<wide> c = {dc.x * kSH0 + 0.5f, dc.y * kSH0 + 0.5f, dc.z * kSH0 + 0.5f};
+  for (int k = 0; k < bands; ++k) c = c + Vec3<wide>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]} * load_wide(Y[k]);
+  const wide zero = splat<wide>(0.f);
+  return {max(c.x, zero), max(c.y, zero), max(c.z, zero)};
 }
 
 // Where a chunk of Gaussians leaves the ids and depth keys of those that are visible, in index order.
@@ -67,12 +81,31 @@ struct Visible {
   Found found;
 };
 
+// Records of a vector of splats, field by field; there is room for a full one.
+inline void write_records(Record* records, const wide (&field)[12]) {
+  const auto four = [&](int f) {
+    store_fours({field[f], field[f + 1], field[f + 2], field[f + 3]}, [&](int l, f4 v) { store4(&records[l].mx + f, v); });
+  };
+  four(0), four(4), four(8);
+}
+
+// The least whole number that is not less; 2^30 at most.
+inline widei ceiling(wide x) {
+  const wide y = min(x, splat<wide>(1073741824.f));
+  const widei whole = to_int(y);
+  return whole - (to_float(whole) < y);  // true is -1
+}
+
 // One vector of Gaussians.
 inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, Visible& visible) {
   const Camera& cam = frame.camera;
   int64_t index[kWide];
   for (int l = 0; l < kWide; ++l) index[l] = first + (l < lanes ? l : 0);
   const Splat3D<wide> g = load_splats(P, index);
+  Record* records = frame.records.as<Record>() + first;
+  Cover* covers = frame.covers.as<Cover>() + first;
+  for (int l = 0; l < kWide; ++l) __builtin_prefetch(records + kGaussiansAhead + l, 1);
+  for (int l = 0; l < kWide; l += 4) __builtin_prefetch(covers + kGaussiansAhead + l, 1);
   const Projected<wide> p = project(cam, g);
 
   const wide k = splat<wide>(kHalfLog2E);
@@ -85,38 +118,33 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
                 (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) & (p.my + ry > 0.f) &
                 (p.my - ry < static_cast<float>(cam.height));
   const int mask = movemask(ok) & ((1 << lanes) - 1);
-
-  alignas(64) float Y[15][kWide], out[10][kWide], rad[2][kWide];
-  const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
-  if (mask) {
-    view_basis(cam, g.mean, frame.sh_degree, Y);
-    const wide fields[8] = {p.mx, p.my, A, B, C, lo, p.t.z, p.t.z};
-    for (int f = 0; f < 7; ++f) store_wide(out[f], fields[f]);
-    store_wide(rad[0], rx), store_wide(rad[1], ry);
+  radii += 2 * first;
+  if (!mask) {
+    std::memset(radii, 0, sizeof(int32_t) * 2 * lanes);
+    for (int l = 0; l < lanes; ++l) covers[l] = {};
+    return;
   }
-  TileBox boxes[kWide] = {};
-  uint64_t tiles[kWide] = {};
-  for (int l = 0; l < lanes; ++l)
-    if (mask >> l & 1) boxes[l] = tile_box(frame, out[0][l], out[1][l], rad[0][l], rad[1][l]);
-  if (mask && frame.skips.tiles) tile_masks(p.mx, p.my, A, B, C, lo, boxes, tiles);
-  Record* records = frame.records.as<Record>();
-  Cover* covers = frame.covers.as<Cover>();
+  const TileBoxes boxes = tile_boxes(frame, p.mx, p.my, rx, ry, ok);
+  const Vec3<wide> color = sh_color(frame, P, index, g.mean);
+  write_records(records, {p.mx, p.my, A, B, C, lo, color.x, color.y, color.z, p.t.z,
+                from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
+  alignas(64) int32_t box[4][kWide], tiles[2][kWide], radius[2][kWide], keys[kWide];
+  store_widei(box[0], boxes.x0), store_widei(box[1], boxes.x1), store_widei(box[2], boxes.y0), store_widei(box[3], boxes.y1);
+  store_widei(radius[0], ceiling(rx) & ok), store_widei(radius[1], ceiling(ry) & ok);
+  store_widei(keys, bits(p.t.z));  // positive floats sort like their bits
+  if (frame.skips.tiles) {
+    const TileMasks masks = tile_masks(p.mx, p.my, A, B, C, lo, boxes);
+    store_widei(tiles[0], masks.low), store_widei(tiles[1], masks.high);
+  }
   for (int l = 0; l < lanes; ++l) {
     const uint32_t id = static_cast<uint32_t>(first + l);
-    radii[2 * (first + l)] = radii[2 * (first + l) + 1] = 0;
-    covers[id] = {};
-    if (!(mask >> l & 1)) continue;
-    Record& r = records[id];
-    const f4 c = sh_color(P, first + l, Y, l, bands);
-    r.mx = out[0][l], r.my = out[1][l], r.A = out[2][l], r.B = out[3][l], r.C = out[4][l], r.log2_opacity = out[5][l];
-    r.r = c[0] > 0.f ? c[0] : 0.f, r.g = c[1] > 0.f ? c[1] : 0.f, r.b = c[2] > 0.f ? c[2] : 0.f, r.depth = out[6][l];
-    r.x0 = static_cast<uint16_t>(boxes[l].x0), r.x1 = static_cast<uint16_t>(boxes[l].x1);
-    r.y0 = static_cast<uint16_t>(boxes[l].y0), r.y1 = static_cast<uint16_t>(boxes[l].y1);
-    covers[id] = cover_of(frame, id, boxes[l], tiles[l]);
-    for (int a = 0; a < 2; ++a) radii[2 * (first + l) + a] = clamp_int(__builtin_ceilf(rad[a][l]), 1 << 30);
-    visible.ids[visible.found.visible] = id;
-    std::memcpy(&visible.keys[visible.found.visible++], &r.depth, 4);  // positive floats sort like their bits
-    visible.found.intersections += covers[id].slot;
+    const int seen = mask >> l & 1;
+    const uint64_t touched = static_cast<uint32_t>(tiles[0][l]) | static_cast<uint64_t>(tiles[1][l]) << 32;
+    covers[l] = seen ? cover_of(frame, id, {box[0][l], box[1][l], box[2][l], box[3][l]}, touched) : Cover{};
+    radii[2 * l] = radius[0][l], radii[2 * l + 1] = radius[1][l];
+    visible.ids[visible.found.visible] = id, visible.keys[visible.found.visible] = static_cast<uint32_t>(keys[l]);
+    visible.found.visible += seen;  // what was written is overwritten if not
+    visible.found.intersections += covers[l].slot;
   }
 }
 
@@ -153,125 +181,12 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
   covers[P.count].slot = static_cast<uint32_t>(frame.intersections);
 }
 
-// dLoss/d(direction), before normalisation.
-inline void sh_backward(const Parameters& P, int64_t n, int bands, const float (*Yx)[kWide], const float (*Yy)[kWide],
-                        const float (*Yz)[kWide], int lane, const float* v_color, float* v_direction) {
-  const f4 v = {v_color[0], v_color[1], v_color[2], 0.f};
-  f4 dx = splat<f4>(0.f), dy = dx, dz = dx;
-  for_each_band(P, n, bands, [&](int k, f4 sh) { dx += sh * Yx[k][lane], dy += sh * Yy[k][lane], dz += sh * Yz[k][lane]; });
-  dx *= v, dy *= v, dz *= v;
-  v_direction[0] = dx[0] + dx[1] + dx[2], v_direction[1] = dy[0] + dy[1] + dy[2], v_direction[2] = dz[0] + dz[1] + dz[2];
-}
-
 // Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 at `row`, but for bands that are not drawn. Writes one float more, which is the
 // next row's or spare.
 inline void bands_gradient(const float* v_sh0, int64_t n, int bands, const float (*Y)[kWide], int lane, float* row) {
   const float* v = v_sh0 + 3 * n;
   const f4 v_color = f4{v[0], v[1], v[2], 0.f} * (1.f / kSH0);
   for (int k = 0; k < bands; ++k) store4(row + 3 * k, v_color * Y[k][lane]);
-}
-
-// The rows of one splat, summed in slot order; false when all are zero, or there are none: no pixel saw it.
-inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
-  const float* row = frame.rows.as<float>() + static_cast<int64_t>(cover->slot) * kRow;
-  wide sum[kRow / kWide] = {};
-  for (uint32_t k = cover[0].slot; k < cover[1].slot; ++k, row += kRow)
-    for (int h = 0; h < kRow / kWide; ++h) sum[h] += load_wide(row + h * kWide);
-  widei nonzero = splat_widei(0);
-  for (int h = 0; h < kRow / kWide; ++h) store_wide(out + h * kWide, sum[h]), nonzero |= sum[h] != 0.f;
-  return any(nonzero);
-}
-
-// A full vector, always: a compiler that knew how many lanes count would round otherwise for whole vectors than for the last one.
-inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kWide],
-                                   const float sums[kWide][kRow]) {
-  const Camera& cam = frame.camera;
-  const Record* records = frame.records.as<Record>();
-  wide field[kRow];
-  for (int h = 0; h < kRow; h += 8) load_columns(sums[0] + h, kRow, field + h);
-  const Splat3D<wide> g = load_splats(P, index);
-  const Projected<wide> p = project(cam, g);
-  const Whitening<wide> L = whitening(p);
-  // Blending measures u and v in units of sqrt(kHalfLog2E).
-  constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
-  const wide su = field[kSu] * length, sv = field[kSv] * length;
-  const SplatGradient<wide> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
-                               L.A * su, L.B * su + L.C * sv, field[kWz]};
-  Splat3D<wide> out = project_backward(cam, p, L, v);
-
-  wide bx[15], by[15], bz[15], inv;
-  alignas(64) float Y[15][kWide], Yx[15][kWide], Yy[15][kWide], Yz[15][kWide];
-  const Vec3<wide> d = view_directions(cam, p.offset, inv);
-  const int degree = frame.sh_degree, bands = (degree + 1) * (degree + 1) - 1;
-  if (G.shN) view_basis(cam, g.mean, degree, Y);
-  sh_basis_gradient(degree, d.x, d.y, d.z, bx, by, bz);
-  for (int k = 0; k < bands; ++k) store_wide(Yx[k], bx[k]), store_wide(Yy[k], by[k]), store_wide(Yz[k], bz[k]);
-  alignas(64) float vd[3][kWide] = {};
-  for (int l = 0; l < kWide; ++l) {
-    const int64_t n = index[l];
-    const Record& r = records[n];
-    float direction[3];
-    const float color[3] = {r.r > 0.f ? sums[l][kWr] : 0.f, r.g > 0.f ? sums[l][kWg] : 0.f, r.b > 0.f ? sums[l][kWb] : 0.f};
-    for (int ch = 0; ch < 3; ++ch) G.sh0[3 * n + ch] = color[ch] * kSH0;
-    sh_backward(P, n, bands, Yx, Yy, Yz, l, color, direction);
-    if (G.shN) {
-      float row[3 * kMaxBands + 1] = {};
-      bands_gradient(G.sh0, n, bands, Y, l, row);
-      std::memcpy(G.shN + 3 * P.sh_rest * n, row, sizeof(float) * 3 * P.sh_rest);
-    }
-    for (int a3 = 0; a3 < 3; ++a3) vd[a3][l] = direction[a3];
-  }
-  Vec3<wide> u = {load_wide(vd[0]), load_wide(vd[1]), load_wide(vd[2])};
-  u = (u - d * dot(u, d)) * inv;
-  out.mean = out.mean + u;
-
-  const wide results[15] = {out.mean.x, out.mean.y,      out.mean.z,      out.qw,          out.qx,    out.qy, out.qz, out.log_scale.x,
-                          out.log_scale.y, out.log_scale.z, out.logit, v.mx, v.my, field[kAbsX], field[kAbsY]};
-  alignas(64) float t[15][kWide];
-  for (int k = 0; k < 15; ++k) store_wide(t[k], results[k]);
-  for (int l = 0; l < kWide; ++l) {
-    const int64_t n = index[l];
-    for (int k = 0; k < 3; ++k) G.means[3 * n + k] = t[k][l], G.log_scales[3 * n + k] = t[7 + k][l];
-    for (int k = 0; k < 4; ++k) G.quats[4 * n + k] = t[3 + k][l];
-    G.logit_opacities[n] = t[10][l];
-    for (int k = 0; k < 2; ++k) G.means2d[2 * n + k] = t[11 + k][l];
-    if (G.means2d_abs)
-      for (int k = 0; k < 2; ++k) G.means2d_abs[2 * n + k] = t[13 + k][l];
-  }
-}
-
-inline void zero_gradient(const Parameters& P, const ParameterGradients& G, int64_t n) {
-  for (int k = 0; k < 3; ++k) G.means[3 * n + k] = G.log_scales[3 * n + k] = G.sh0[3 * n + k] = 0.f;
-  for (int k = 0; k < 4; ++k) G.quats[4 * n + k] = 0.f;
-  G.logit_opacities[n] = 0.f;
-  G.means2d[2 * n] = G.means2d[2 * n + 1] = 0.f;
-  if (G.means2d_abs) G.means2d_abs[2 * n] = G.means2d_abs[2 * n + 1] = 0.f;
-  if (G.shN && P.sh_rest) std::memset(G.shN + 3 * P.sh_rest * n, 0, sizeof(float) * 3 * P.sh_rest);
-}
-
-// Gaussians that no pixel saw get zeros; the others are packed into full vectors, in index order.
-inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P, const ParameterGradients& G) {
-  const Cover* covers = frame.covers.as<Cover>();
-  parallel(pool, divide_up(P.count, kProjectChunk), [&](int chunk, int) {
-    const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk;
-    const int64_t end = begin + kProjectChunk < P.count ? begin + kProjectChunk : P.count;
-    int64_t index[kWide];
-    alignas(64) float sums[kWide][kRow] = {};
-    int lanes = 0;
-    for (int64_t n = begin; n < end; ++n) {
-      if (!sum_rows(frame, &covers[n], sums[lanes])) {
-        zero_gradient(P, G, n);
-        continue;
-      }
-      prefetch_bands(P, n);
-      index[lanes++] = n;
-      if (lanes == kWide) project_backward_lanes(frame, P, G, index, sums), lanes = 0;
-    }
-    if (lanes) {
-      for (int l = lanes; l < kWide; ++l) index[l] = index[0], std::memcpy(sums[l], sums[0], sizeof(sums[0]));
-      project_backward_lanes(frame, P, G, index, sums);
-    }
-  });
 }
 
 }  // namespace gsopt::GSOPT_ISA

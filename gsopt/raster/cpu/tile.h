@@ -1,9 +1,9 @@
 // What forward and backward share inside one tile: splats in tile coordinates, and its pixels in blocks of 4x2 or 4x4.
 // Coordinates are relative to the tile's centre, so the numbers stay small wherever the tile lies in the image.
 #pragma once
+#include "columns.h"
 #include "frame.h"
 #include "parallel.h"
-#include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
 

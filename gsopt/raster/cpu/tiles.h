@@ -15,28 +15,30 @@ struct TileBox {
   int x0, x1, y0, y1;  // half open
   bool masked() const { return x1 - x0 <= kMaskSide && y1 - y0 <= kMaskSide; }
 };
-inline int clamp_int(float x, int high) {  // floor for x >= 0, safe for any x
-  return x <= 0.f ? 0 : (x >= static_cast<float>(high) ? high : static_cast<int>(x));
-}
-inline TileBox tile_box(const Frame& frame, float mx, float my, float rx, float ry) {
+
+// The boxes of a vector of splats; empty where they are not seen.
+struct TileBoxes {
+  widei x0, x1, y0, y1;
+};
+inline TileBoxes tile_boxes(const Frame& frame, wide mx, wide my, wide rx, wide ry, widei seen) {
   constexpr float inv = 1.f / kTile;
-  return {clamp_int((mx - rx) * inv, frame.tiles_x), clamp_int((mx + rx) * inv + 1.f, frame.tiles_x),
-          clamp_int((my - ry) * inv, frame.tiles_y), clamp_int((my + ry) * inv + 1.f, frame.tiles_y)};
+  const auto within = [&](wide tile, int tiles) { return to_int(clamp(tile, splat<wide>(0.f), splat<wide>(static_cast<float>(tiles)))) & seen; };
+  return {within((mx - rx) * inv, frame.tiles_x), within((mx + rx) * inv + 1.f, frame.tiles_x), within((my - ry) * inv, frame.tiles_y),
+          within((my + ry) * inv + 1.f, frame.tiles_y)};
 }
 
-// Masks of a vector of splats; of a box that is larger the result is arbitrary.
-inline void tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, const TileBox box[kWide], uint64_t out[kWide]) {
-  alignas(64) int32_t x0[kWide], y0[kWide], columns[kWide], rows[kWide], bits[kWide];
-  int most = 0;
-  for (int l = 0; l < kWide; ++l) {
-    x0[l] = box[l].x0, y0[l] = box[l].y0, columns[l] = box[l].x1 - box[l].x0, rows[l] = box[l].y1 - box[l].y0, out[l] = 0;
-    most = rows[l] > most && box[l].masked() ? rows[l] : most;
-  }
+// Which tiles of their boxes a vector of splats touches, rows 0 to 3 and 4 to 7; of a box that is larger the result is arbitrary.
+struct TileMasks {
+  widei low, high;
+};
+inline TileMasks tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, const TileBoxes& boxes) {
+  const widei columns = boxes.x1 - boxes.x0, rows = boxes.y1 - boxes.y0, one = splat_widei(1), inside = shift_left(one, columns) - one;
+  const int highest = most(rows & (columns <= kMaskSide) & (rows <= kMaskSide));
   const wide zero = splat<wide>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f, iA = splat<wide>(1.f) / A, slope = B * iA;
   const wide extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
-  const wide x = mx - to_float(load_widei(x0)) * static_cast<float>(kTile), first_row = to_float(load_widei(y0)) * static_cast<float>(kTile) + 0.5f - my;
-  const widei one = splat_widei(1), inside = shift_left(one, load_widei(columns)) - one;
-  for (int row = 0; row < most; ++row) {
+  const wide x = mx - to_float(boxes.x0) * static_cast<float>(kTile), first_row = to_float(boxes.y0) * static_cast<float>(kTile) + 0.5f - my;
+  TileMasks out = {splat_widei(0), splat_widei(0)};
+  for (int row = 0; row < highest; ++row) {
     const wide top = first_row + static_cast<float>(row * kTile), bottom = top + (kTile - 1.f);
     const wide yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
     const wide cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
@@ -45,10 +47,10 @@ inline void tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, const 
     const wide left = x - slope * yl - sqrt(max(sl, zero)) * iA - margin;
     const widei behind = to_int(clamp((right + (kTile - 0.5f)) * (1.f / kTile), zero, splat<wide>(kMaskSide + 0.5f)));
     const widei first = splat_widei(kMaskSide) - to_int(clamp(splat<wide>(kMaskSide) - (left - (kTile - 0.5f)) * (1.f / kTile), zero, splat<wide>(kMaskSide + 0.5f)));
-    const widei touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside;
-    store_widei(bits, touched & ((sr >= 0.f) | (sl >= 0.f)) & (load_widei(rows) > splat_widei(row)));
-    for (int l = 0; l < kWide; ++l) out[l] |= static_cast<uint64_t>(bits[l]) << (kMaskSide * row);
+    const widei touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside & ((sr >= 0.f) | (sl >= 0.f)) & (rows > row);
+    (row < 4 ? out.low : out.high) |= touched << (kMaskSide * (row % 4));
   }
+  return out;
 }
 
 struct Span {
