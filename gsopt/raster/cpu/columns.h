@@ -4,6 +4,17 @@
 
 namespace gsopt::GSOPT_ISA {
 
+#if defined(__AVX2__)
+inline f8 joined(f4 a, f4 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7); }
+#else  // registers of four lanes: of eight a compiler would move one by one
+inline f8 joined(f4 a, f4 b) {
+  f8 v;
+  store4(reinterpret_cast<float*>(&v), a), store4(reinterpret_cast<float*>(&v) + 4, b);
+  return v;
+}
+inline f4 four(f8 v, int i) { return load4(reinterpret_cast<const float*>(&v) + 4 * i); }
+#endif
+
 // Of every four lanes of a and b: (a0 b0 a1 b1), (a2 b2 a3 b3), (a0 a1 b0 b1), (a2 a3 b2 b3); of every eight, as fours A B:
 // (A0 B0), (A1 B1).
 #if defined(GSOPT_SIXTEEN)
@@ -15,7 +26,7 @@ GSOPT_SHUFFLE(twos_low, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29
 GSOPT_SHUFFLE(twos_high, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31)
 GSOPT_SHUFFLE(fours_low, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27)
 GSOPT_SHUFFLE(fours_high, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31)
-#else
+#elif defined(__AVX2__)
 #define GSOPT_SHUFFLE(name, a0, a1, a2, a3, a4, a5, a6, a7) \
   inline wide name(wide a, wide b) { return __builtin_shufflevector(a, b, a0, a1, a2, a3, a4, a5, a6, a7); }
 GSOPT_SHUFFLE(mixed_low, 0, 8, 1, 9, 4, 12, 5, 13)
@@ -24,6 +35,17 @@ GSOPT_SHUFFLE(twos_low, 0, 1, 8, 9, 4, 5, 12, 13)
 GSOPT_SHUFFLE(twos_high, 2, 3, 10, 11, 6, 7, 14, 15)
 GSOPT_SHUFFLE(fours_low, 0, 1, 2, 3, 8, 9, 10, 11)
 GSOPT_SHUFFLE(fours_high, 4, 5, 6, 7, 12, 13, 14, 15)
+#else
+#define GSOPT_SHUFFLE(name, a0, a1, a2, a3) \
+  inline wide name(wide a, wide b) { \
+    return joined(__builtin_shufflevector(four(a, 0), four(b, 0), a0, a1, a2, a3), __builtin_shufflevector(four(a, 1), four(b, 1), a0, a1, a2, a3)); \
+  }
+GSOPT_SHUFFLE(mixed_low, 0, 4, 1, 5)
+GSOPT_SHUFFLE(mixed_high, 2, 6, 3, 7)
+GSOPT_SHUFFLE(twos_low, 0, 1, 4, 5)
+GSOPT_SHUFFLE(twos_high, 2, 3, 6, 7)
+inline wide fours_low(wide a, wide b) { return joined(four(a, 0), four(b, 0)); }
+inline wide fours_high(wide a, wide b) { return joined(four(a, 1), four(b, 1)); }
 #endif
 #undef GSOPT_SHUFFLE
 
@@ -32,8 +54,6 @@ inline void transpose_fours(wide v[4]) {
   const wide a = mixed_low(v[0], v[1]), b = mixed_high(v[0], v[1]), c = mixed_low(v[2], v[3]), d = mixed_high(v[2], v[3]);
   v[0] = twos_low(a, c), v[1] = twos_high(a, c), v[2] = twos_low(b, d), v[3] = twos_high(b, d);
 }
-
-inline f8 joined(f4 a, f4 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7); }
 
 // Four floats of each of kWide rows, row(lane), become four columns.
 template <class Row> inline void load_fours(Row&& row, wide v[4]) {
