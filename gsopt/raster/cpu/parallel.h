@@ -9,6 +9,6 @@ template <class Body> inline void parallel(Pool& pool, int items, Body&& body) {
   pool.run(items, [](void* context, int item, int worker) { (*static_cast<Plain*>(context))(item, worker); }, &body);
 }
 
-inline int divide_up(int64_t a, int64_t b) { return static_cast<int>((a + b - 1) / b); }
+constexpr int divide_up(int64_t a, int64_t b) { return static_cast<int>((a + b - 1) / b); }
 
 }  // namespace gsopt::GSOPT_ISA

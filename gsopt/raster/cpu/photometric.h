@@ -94,7 +94,7 @@ template <int Maps> class Columns {
   }
 
  private:
-  static constexpr int kPad = kHalo + 1, kStride = kStrip + 2 * kHalo + 2 * kPad + kWide;
+  static constexpr int kPad = kHalo + 1, kStride = divide_up(kStrip + 2 * kHalo + 2 * kPad + kWide, 16) * 16;
   static constexpr float kNothing[kStride] = {};
 
   // A row of an image from `first` on: zeros above and below it, a copy that fills a vector where it is too narrow for one.

@@ -128,7 +128,7 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   const Vec3<wide> color = sh_color(frame, P, index, g.mean);
   write_records(records, {p.mx, p.my, A, B, C, lo, color.x, color.y, color.z, p.t.z,
                 from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
-  alignas(64) int32_t box[4][kWide], tiles[2][kWide], radius[2][kWide], keys[kWide];
+  alignas(64) int32_t box[4][kWide], tiles[2][kWide] = {}, radius[2][kWide], keys[kWide];
   store_widei(box[0], boxes.x0), store_widei(box[1], boxes.x1), store_widei(box[2], boxes.y0), store_widei(box[3], boxes.y1);
   store_widei(radius[0], ceiling(rx) & ok), store_widei(radius[1], ceiling(ry) & ok);
   store_widei(keys, bits(p.t.z));  // positive floats sort like their bits
