@@ -7,13 +7,18 @@
 namespace gsopt::GSOPT_ISA {
 
 constexpr int kRadixBits = 11, kRadix = 1 << kRadixBits;
-constexpr int kSortChunk = 1 << 15;
 constexpr int kAhead = 48;  // splats are visited in depth order, that is anywhere in memory: ask for them early
+
+// How many numbers a thread sorts at once: each its share, of few or of very many some more chunks.
+inline int64_t sort_chunk(const Pool& pool, int64_t n) {
+  const int64_t fair = divide_up(n, pool.threads());
+  return fair < 4096 ? 4096 : (fair > 32768 ? 32768 : fair);
+}
 
 // Least significant digit first, 3 passes of 11 bits; chunks of the input keep their order, so ties go by index.
 inline void sort_stage(Pool& pool, Frame& frame) {
-  const int64_t n = frame.visible;
-  const int chunks = divide_up(n, kSortChunk);
+  const int64_t n = frame.visible, size = sort_chunk(pool, n);
+  const int chunks = divide_up(n, size);
   Buffer *keys[2] = {&frame.keys, &frame.keys2}, *ids[2] = {&frame.order, &frame.order2};
   uint32_t* histogram = frame.histogram.as<uint32_t>();
   for (int pass = 0; pass < 3; ++pass) {
@@ -21,8 +26,7 @@ inline void sort_stage(Pool& pool, Frame& frame) {
     const uint32_t *key = keys[from]->as<uint32_t>(), *id = ids[from]->as<uint32_t>();
     uint32_t *key_out = keys[1 - from]->as<uint32_t>(), *id_out = ids[1 - from]->as<uint32_t>();
     const auto range = [&](int chunk, int64_t& begin, int64_t& end) {
-      begin = static_cast<int64_t>(chunk) * kSortChunk;
-      end = begin + kSortChunk < n ? begin + kSortChunk : n;
+      begin = chunk * size, end = begin + size < n ? begin + size : n;
     };
     parallel(pool, chunks, [&](int chunk, int) {
       uint32_t* h = histogram + static_cast<int64_t>(chunk) * kRadix;
@@ -103,7 +107,7 @@ inline void fill_stage(Pool& pool, Frame& frame, int chunks) {
 inline bool bin_stage(Pool& pool, Frame& frame, int64_t max_entries) {
   if (frame.intersections > max_entries) return false;
   const int chunks = frame.visible < 4096 ? 1 : pool.threads();
-  const size_t sort_bytes = sizeof(uint32_t) * kRadix * divide_up(frame.visible, kSortChunk);
+  const size_t sort_bytes = sizeof(uint32_t) * kRadix * divide_up(frame.visible, sort_chunk(pool, frame.visible));
   const size_t count_bytes = sizeof(uint32_t) * frame.tiles() * static_cast<size_t>(chunks);
   frame.histogram.reserve(sort_bytes > count_bytes ? sort_bytes : count_bytes);
   sort_stage(pool, frame);
