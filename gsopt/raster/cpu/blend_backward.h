@@ -4,9 +4,8 @@
 // already composited, s = alpha dLoss/dalpha = w (q - A). Behind the last splat A = background·g - dLoss/dalpha_out.
 // T is recovered by dividing by 1 - alpha; it never falls below what the forward pass stopped at.
 //
-// Splat by splat, and for each three times over the blocks that it touches: its alphas, s and the sums of the colors, the
-// sums of s. In each of these loops all sums stay in registers while the blocks pass by, and a processor that looks some
-// hundred instructions ahead finds several blocks to work on. Each (splat, tile) pair owns one
+// Splat by splat, and for each twice over the blocks that it touches: its alphas, then s and all sums. These stay in registers
+// while the blocks pass by, and a processor that looks some hundred instructions ahead finds several blocks to work on. Each (splat, tile) pair owns one
 // row of sums, so no two threads ever add to the same number and the result does not depend on their order.
 #pragma once
 #include "tile.h"
@@ -77,8 +76,7 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
   alphas_of(Spread(splat_i), mask, alphas);
-  px* s_of = alphas.alpha;  // written over the alphas, which no one needs again
-  px wr = zero, wg = zero, wb = zero, wz = zero;
+  px wr = zero, wg = zero, wb = zero, wz = zero, s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, abs_x = zero, abs_y = zero;
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     BlockGradient& p = grads[__builtin_ctz(rest)];
@@ -88,13 +86,10 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
     px q = r * gr + g * gg + b * gb;
     if (Depth) q = q + depth * load_px(p.depth);
     store_px(p.T, T), store_px(p.behind, behind * past + alpha * q);
-    s_of[n] = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
     wr = wr + weight * gr, wg = wg + weight * gg, wb = wb + weight * gb;
     if (Depth) wz = wz + weight * load_px(p.depth);
-  }
-  px s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, abs_x = zero, abs_y = zero;
-  for (int k = 0; k < n; ++k) {
-    const px s = s_of[k], u = alphas.u[k], v = alphas.v[k], s_u = s * u, s_v = s * v;
+    const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
+    const px u = alphas.u[n], v = alphas.v[n], s_u = s * u, s_v = s * v;
     s0 = s0 + s, su = su + s_u, sv = sv + s_v, suu = suu + s_u * u, suv = suv + s_u * v, svv = svv + s_v * v;
     if (Abs) abs_x = abs_x + abs(s_u), abs_y = abs_y + abs(B * s_u + C * s_v);
   }
