@@ -24,7 +24,7 @@ from gsopt.benchmark.machine import machine
 from gsopt.cli import main as gsopt
 from gsopt.events import to_json, write_atomic
 
-UNGUARDED = ["--guidance.guard-views", "0"]
+UNGUARDED = ["--lambda-sds", "0.2", "--guidance.guard-views", "0"]
 SDS = ["--guidance.policy", "sds", *UNGUARDED]
 ARMS: dict[str, list[str]] = {
     "off": ["--lambda-sds", "0"],
@@ -33,11 +33,12 @@ ARMS: dict[str, list[str]] = {
     "sds": SDS,
     "sds, words": [*SDS, "--guidance.references", "0", "--guidance.image-weight", "0"],
 }
-"""All but `default` without the guard. `words`: no input view is shown, but the object's name is told."""
+"""`words`: no input view is shown, but the object's name is told. All but `default` are guided, whatever the views, and
+without the guard."""
 NAMES = {
     "off": "unguided",
     "default": "default",
-    "recon": "recon, what is taken by itself",
+    "recon": "recon, the policy that is taken by itself",
     "sds": "SDS that sees the input views",
     "sds, words": "SDS that is told the object's name, no views",
 }
@@ -67,6 +68,8 @@ def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespac
         raise SystemExit(f"{scene.name}, {views} views, {arm}: gsopt train ended with {code}")
     metrics = json.loads((folder / "metrics.json").read_text())
     summary = folder / "guidance" / "summary.json"
+    if arm not in ("off", "default") and not summary.exists():
+        raise SystemExit(f"{scene.name}, {views} views, {arm}: the run was not guided.")
     return {
         "scene": scene.name,
         "views": views,

@@ -4,11 +4,11 @@
 
 DATA holds `nerf_synthetic_lego_400` and `fox`. Arms of each scene: `plain` (every skip off but the kernels' own),
 `bare` (those off as well), `all` (every skip on), `free` (beside the kernels' own only those whose row says no more
-than 0.1 dB on either scene) and `no-X` (every skip but X). An arm is one `gsopt train --threads 1` in a process of its
-own; its CPU time (user and system, all threads, over the training steps alone) and its held-out metrics go to
-benchmarks/results/skips.json. Arms that have a record are not measured again, an arm that was cut short goes on from
-its last checkpoint, and a skip that acts late forks from the checkpoint of `all` at step 4000. --draw writes the table
-without measuring.
+than 0.1 dB on either scene), `no-X` (every skip but X), and `plain` and `free` again with other seeds. An arm is one
+`gsopt train --threads 1` in a process of its own; its CPU time (user and system, all threads, over the training steps
+alone) and its held-out metrics go to benchmarks/results/skips.json. Arms that have a record are not measured again, an
+arm that was cut short goes on from its last checkpoint, and a skip that acts late forks from the checkpoint of `all` at
+step 4000. --draw writes the table without measuring.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,14 @@ RESULT = ROOT / "benchmarks" / "results" / "skips.json"
 PAGE = ROOT / "docs" / "performance.md"
 FORK = 4000
 """Before the last refinement of 7000 steps, which views that rest and flat losses wait for."""
-TOGETHER = (("plain", "bare"), ("free", "bare"), ("all", "plain"), ("all", "bare"))
+TOGETHER = (("plain", "bare"), ("free", "plain"), ("free", "bare"), ("all", "plain"), ("all", "bare"))
+SEEDS = (1, 2)
+"""Beside 0, for the arms that say what is free."""
 METRICS = ("psnr", "ssim", "lpips_alex")
 RECORD = {
     "scene": str,
     "arm": str,
+    "seed": int,
     "flags": [str],
     "same_as": (str, None),
     "cpu_seconds": float,
@@ -117,13 +120,18 @@ class Arm:
     name: str
     flags: tuple[str, ...]
     without: Skip | None = None
+    seed: int = 0
 
     @property
     def key(self) -> str:
-        return f"{self.scene}-{self.name}"
+        return key(self.scene, self.name, self.seed)
 
     def folder(self, runs: Path) -> Path:
         return runs / self.key
+
+
+def key(scene: str, name: str, seed: int = 0) -> str:
+    return f"{scene}-{name}-{seed}" if seed else f"{scene}-{name}"
 
 
 def arms() -> list[Arm]:
@@ -139,7 +147,8 @@ def arms() -> list[Arm]:
     for without in SKIPS:
         flags = tuple(flag for skip in SKIPS for flag in (skip.off if skip is without else skip.on))
         found += [Arm(scene, f"no-{without.name}", flags, without) for scene in SCENES]
-    return found
+    again = [arm for arm in found if arm.name in ("plain", "free")]
+    return found + [replace(arm, seed=seed) for seed in SEEDS for arm in again]
 
 
 def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[str, Any] | None:
@@ -150,7 +159,7 @@ def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[s
     if arm.without is not None and changes_nothing(arm, runs):
         return {**full, "arm": arm.name, "flags": list(arm.flags), "same_as": "all"} if full else None
     folder, scene_flags, _ = SCENES[arm.scene]
-    command = ["train", str(root / folder), *scene_flags, *COMMON, *arm.flags]
+    command = ["train", str(root / folder), *scene_flags, *COMMON, "--seed", str(arm.seed), *arm.flags]
     run = arm.folder(runs)
     if arm.without is not None and arm.without.setting is not None and not run.exists():
         fork(Arm(arm.scene, "all", ()).folder(runs), run, *arm.without.setting)
@@ -163,6 +172,7 @@ def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[s
     return {
         "scene": arm.scene,
         "arm": arm.name,
+        "seed": arm.seed,
         "flags": [*scene_flags, *COMMON, *arm.flags],
         "same_as": None,
         "cpu_seconds": metrics["train_cpu_seconds"],
@@ -220,7 +230,7 @@ def read_records() -> dict[str, Any]:
         return {}
     document = json.loads(RESULT.read_bytes())
     schema.require(document, DOCUMENT, RESULT.name)
-    return {f"{record['scene']}-{record['arm']}": record for record in document["records"]}
+    return {key(record["scene"], record["arm"], record["seed"]): record for record in document["records"]}
 
 
 def write_records(records: dict[str, Any]) -> None:
@@ -235,15 +245,14 @@ def page(records: dict[str, Any]) -> str:
     rows = []
     for skip in SKIPS:
         for scene in SCENES:
-            full, without = records.get(f"{scene}-all"), records.get(f"{scene}-no-{skip.name}")
-            if full and without:
-                rows.append([skip.what, scene, *difference(without, full)])
+            if both := pairs(records, scene, f"no-{skip.name}", "all"):
+                rows.append([skip.what, scene, *difference(both)])
     for name, than in TOGETHER:
         for scene in SCENES:
-            slow, fast = records.get(f"{scene}-{than}"), records.get(f"{scene}-{name}")
-            if slow and fast:
-                factor = slow["cpu_seconds"] / fast["cpu_seconds"]
-                rows.append([f"**`{name}` for `{than}`: {factor:.2f}x**", scene, *difference(slow, fast)])
+            if both := pairs(records, scene, than, name):
+                factor = sum(slow["cpu_seconds"] for slow, _ in both) / sum(fast["cpu_seconds"] for _, fast in both)
+                seeds = f", {len(both)} seeds" if len(both) > 1 else ""
+                rows.append([f"**`{name}` for `{than}`: {factor:.2f}x**{seeds}", scene, *difference(both)])
     absolute = [
         [r["scene"], r["arm"], f"{r['cpu_seconds']:.0f} s", f"{r['gaussians']:,}", str(r["steps"]), *figures(r)]
         for key in (f"{scene}-{arm}" for scene in SCENES for arm in ("bare", "plain", "free", "all"))
@@ -258,14 +267,24 @@ def figures(record: dict[str, Any]) -> list[str]:
     return [f"{mean['psnr']:.2f}", f"{mean['ssim']:.4f}", f"{mean['lpips_alex']:.4f}"]
 
 
-def difference(without: dict[str, Any], full: dict[str, Any]) -> list[str]:
-    """What a skip saves and changes: `full` has it, `without` does not."""
-    if without["same_as"]:
+def pairs(records: dict[str, Any], scene: str, without: str, full: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Records of two arms, seed by seed."""
+    keys = [(key(scene, without, seed), key(scene, full, seed)) for seed in (0, *SEEDS)]
+    return [(records[a], records[b]) for a, b in keys if a in records and b in records]
+
+
+def difference(both: list[tuple[dict[str, Any], dict[str, Any]]]) -> list[str]:
+    """What a skip saves and changes, the mean of the pairs: the second of each has it, the first does not."""
+    if both[0][0]["same_as"]:
         return ["0 (the same run)", "0", "0", "0"]
-    saved = without["cpu_seconds"] - full["cpu_seconds"]
-    changes = [full["mean"][name] - without["mean"][name] for name in METRICS]
-    share = 100 * saved / without["cpu_seconds"]
-    return [f"{saved:.0f} s ({share:.0f} %)", f"{changes[0]:+.2f}", f"{changes[1]:+.4f}", f"{changes[2]:+.4f}"]
+    without, full = (sum(pair[k]["cpu_seconds"] for pair in both) / len(both) for k in (0, 1))
+    changes = {name: [fast["mean"][name] - slow["mean"][name] for slow, fast in both] for name in METRICS}
+    mean = {name: sum(values) / len(both) for name, values in changes.items()}
+    psnr = f"{mean['psnr']:+.2f}"
+    if len(both) > 1:
+        psnr += f" ({', '.join(f'{value:+.2f}' for value in changes['psnr'])})"
+    share = 100 * (1 - full / without)
+    return [f"{without - full:.0f} s ({share:.0f} %)", psnr, f"{mean['ssim']:+.4f}", f"{mean['lpips_alex']:+.4f}"]
 
 
 def main() -> None:
