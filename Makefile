@@ -30,14 +30,14 @@ test: lint
 	$(MAKE) sanitize
 
 # Rewrites docs/performance.md and what it quotes; an hour. Alone on the machine the wall times mean something.
-# What every skip saves takes hours and data of its own: python benchmarks/skips.py --root DATA --draw.
+# What every skip saves takes hours and data of its own: python experiments/skips.py --root DATA --draw.
 bench: $(VENV)/.for-test
-	-GSOPT_ISA=avx2 OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json benchmarks/results/kernels.json --parts cases
-	OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json benchmarks/results/kernels.json --parts cases growth accuracy
-	$(PY) -m gsopt bench draw --json benchmarks/results/kernels.json
-	OMP_NUM_THREADS=1 $(PY) -m gsopt bench scenes --json benchmarks/results/presets.json
-	$(PY) -m gsopt bench draw --json benchmarks/results/presets.json
-	OMP_NUM_THREADS=1 $(PY) benchmarks/stress.py
+	-GSOPT_ISA=avx2 OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json experiments/results/kernels.json --parts cases
+	OMP_NUM_THREADS=1 $(PY) -m gsopt bench kernels --json experiments/results/kernels.json --parts cases growth accuracy
+	$(PY) -m gsopt bench draw --json experiments/results/kernels.json
+	OMP_NUM_THREADS=1 $(PY) -m gsopt bench scenes --json experiments/results/presets.json
+	$(PY) -m gsopt bench draw --json experiments/results/presets.json
+	OMP_NUM_THREADS=1 $(PY) experiments/stress.py
 
 # The stress suite in full: five million Gaussians, 100,000 steps at each of four hostile learning rates.
 stress: $(VENV)/.for-test
@@ -75,7 +75,7 @@ test-blender: $(BLENDERS:%=test-blender-%)
 
 test-blender-%: build/blender-%/.ready $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_BLENDERS=$(CURDIR)/build/blender-$*/bin/python \
-	  build/blender-$*/bin/python -m pytest -p no:cacheprovider tests/synth tests/blender
+	  build/blender-$*/bin/python -m pytest -p no:cacheprovider tests/scripts/synth tests/blender
 
 .PRECIOUS: build/blender-%/.ready
 build/blender-%/.ready:

@@ -150,7 +150,7 @@ def color(graph: Graph, given: dict[str, Value]) -> tuple[Value, ...]:
 
 
 def band(degree: int) -> Callable[[Graph, dict[str, Value]], tuple[Value, ...]]:
-    """Writes Σ sh_k Y_k(d) over the harmonics of one degree, in gsopt's order and with its signs (gsopt/sh.py)."""
+    """Writes Σ sh_k Y_k(d) over the harmonics of one degree, in gsopt's order and signs (gsopt/geometry/sh.py)."""
 
     def write(graph: Graph, given: dict[str, Value]) -> tuple[Value, ...]:
         x, y, z = graph.split(given["Direction"])

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOME = {
-    "Cameras": "gsopt.cameras",
+    "Cameras": "gsopt.geometry.cameras",
     "Gaussians": "gsopt.gaussians",
     "GsoptError": "gsopt.errors",
     "RasterSettings": "gsopt.raster.backend",
     "Scene": "gsopt.data.scene",
-    "TrainConfig": "gsopt.config",
-    "evaluate": "gsopt.evaluation",
+    "TrainConfig": "gsopt.config.train",
+    "evaluate": "gsopt.results.evaluation",
     "load_scene": "gsopt.data.scene",
     "load_splats": "gsopt.formats",
     "rasterize": "gsopt.raster.api",
@@ -41,15 +41,15 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from gsopt.cameras import Cameras
-    from gsopt.config import TrainConfig
+    from gsopt.config.train import TrainConfig
     from gsopt.data.scene import Scene, load_scene
     from gsopt.errors import GsoptError
-    from gsopt.evaluation import evaluate
     from gsopt.formats import load_splats, save_splats
     from gsopt.gaussians import Gaussians
+    from gsopt.geometry.cameras import Cameras
     from gsopt.raster.api import rasterize
     from gsopt.raster.backend import RasterSettings
+    from gsopt.results.evaluation import evaluate
     from gsopt.training.loop import train
 
 

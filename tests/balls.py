@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsopt.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 from gsopt.symmetry.mirror import Mirror
 
 FIELD_OF_VIEW = 0.6

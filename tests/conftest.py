@@ -20,7 +20,7 @@ def no_prior_at_hand() -> Iterator[None]:
     """Runs are not guided unless a test says so: most tests are about something else, and the embedded prior takes
     seconds to load. Only in this process: what starts another says --lambda_sds 0."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsopt.sds.choice.EMBEDDED", ROOT / "no-prior")
+        patch.setattr("gsopt.sds.select_prior.EMBEDDED", ROOT / "no-prior")
         yield
 
 
@@ -28,7 +28,7 @@ def no_prior_at_hand() -> Iterator[None]:
 def embedded(monkeypatch: pytest.MonkeyPatch) -> Path:
     """The prior that ships, at its place."""
     folder = ROOT / "gsopt" / "sds" / "embedded"
-    monkeypatch.setattr("gsopt.sds.choice.EMBEDDED", folder)
+    monkeypatch.setattr("gsopt.sds.select_prior.EMBEDDED", folder)
     return folder
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from gsopt.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
-from gsopt.config import DataConfig, TrainConfig
+from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.events import to_json
 from gsopt.formats import save_splats
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.render import draw
+from gsopt.results.finished_run import draw
 
 WIDTH, HEIGHT, FOV = 40, 32, 0.8
 WHITE = torch.ones(3)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageFilter
 
-from gsopt.cameras import look_at
+from gsopt.geometry.cameras import look_at
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 TEXTURE = 512

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gsopt.benchmark.stopwatch import repeat, spread
 from gsopt.benchmark.surface import surface_scene
-from gsopt.cameras import Cameras
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import (
     ALPHA_MAX,

@@ -17,9 +17,9 @@ from torch import Tensor
 from gsopt import check
 from gsopt.benchmark.stopwatch import Reading, both, repeat
 from gsopt.benchmark.surface import surface_scene
-from gsopt.cameras import Cameras
-from gsopt.config import OptimizerConfig
+from gsopt.config.train import OptimizerConfig
 from gsopt.errors import UsageError
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.raster.cpu_backend import CpuBackend
 from gsopt.training.optimizer import Model, adam_step, learning_rates

@@ -8,8 +8,8 @@ from typing import Any
 from gsopt.benchmark.charts import Axis, Series, chart
 from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.scenes import front
+from gsopt.config.presets import PRESETS
 from gsopt.events import write_atomic
-from gsopt.presets import PRESETS
 
 SECONDS = "CPU seconds, 1 thread"
 METRICS = {"psnr": ("PSNR", "PSNR, dB"), "lpips_alex": ("LPIPS", "LPIPS (Alex), lower is better")}

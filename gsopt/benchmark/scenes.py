@@ -11,16 +11,16 @@ from typing import Any
 
 import torch
 
-from gsopt.config import DataConfig, DensityConfig, TrainConfig
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.presets import with_preset
+from gsopt.config.train import DataConfig, DensityConfig, TrainConfig
 from gsopt.errors import UsageError
-from gsopt.evaluation import evaluate_views
 from gsopt.formats import load_splats
 from gsopt.gaussians import Gaussians
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.presets import with_preset
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
-from gsopt.render import BACKGROUNDS
+from gsopt.results.evaluation import evaluate_views
+from gsopt.results.finished_run import BACKGROUNDS
 from gsopt.training.loop import TrainResult, train
 
 LOOKS = 8

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt import quats
-from gsopt.cameras import Cameras, intrinsics, look_at
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import quats
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.init.neighbors import mean_neighbor_distance
 from gsopt.training.morton import morton_order
 

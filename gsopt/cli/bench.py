@@ -12,8 +12,8 @@ import tyro
 from tyro.conf import arg
 
 from gsopt import check
+from gsopt.config.presets import Preset
 from gsopt.errors import InputError, UsageError
-from gsopt.presets import Preset
 
 Part = Literal["cases", "growth", "accuracy"]
 
@@ -200,7 +200,7 @@ def tasks(flags: Scenes) -> list[Any]:
     from gsopt.benchmark.kernels import read_count
     from gsopt.benchmark.scenes import Task
     from gsopt.cli.demo import SCENE
-    from gsopt.config import DataConfig
+    from gsopt.config.train import DataConfig
 
     data = DataConfig(str((flags.data or SCENE).absolute()), downscale=flags.resolution, eval=flags.eval)
     name = "demo" if flags.data is None else flags.data.resolve().name
@@ -228,17 +228,17 @@ def suite(flags: Suite) -> int:
     check.within("--seeds", flags.seeds, 1, 1000, "3 is usual.")
     check.within("--threads", flags.threads, 1, 256, "The figures do not depend on it.")
 
-    from gsopt.benchmark import suite as declared
+    from gsopt.benchmark.suite import definition as declared
 
     whole = declared.load(flags.suite)
     part = declared.chosen(whole, flags.groups)
     cases = list(declared.cases(part, flags.seeds, flags.arms))
     root = declared.find_root(part, flags.root)
 
-    from gsopt.benchmark import suite_file
-    from gsopt.benchmark.suite_bench import run_suite, work_folder
-    from gsopt.benchmark.suite_html import write_html
-    from gsopt.benchmark.suite_run import Bench
+    from gsopt.benchmark.suite import result_file
+    from gsopt.benchmark.suite.html_page import write_html
+    from gsopt.benchmark.suite.runner import run_suite, work_folder
+    from gsopt.benchmark.suite.single_run import Bench
 
     output = flags.output.absolute()
     folder = Path(flags.prior or "").expanduser()  # a run starts in another folder; any other name is an id
@@ -247,7 +247,7 @@ def suite(flags: Suite) -> int:
     command = suite_command(flags)
     failed = run_suite(output, whole.name, command, cases, bench, lambda text: print(text, flush=True))
     drawn = output.with_suffix(".html")
-    write_html(suite_file.read(output), suite_file.read_pictures(output), drawn)
+    write_html(result_file.read(output), result_file.read_pictures(output), drawn)
     print(f"Written: {output}, {drawn}")
     return InputError.exit_code if failed else 0
 
@@ -278,12 +278,12 @@ def draw(flags: Draw) -> int:
 
 def draw_suite(flags: Draw) -> None:
     """The block of the suite in the page, its charts and the grid of pictures beside it, and the page of its own."""
-    from gsopt.benchmark import suite_file, suite_html, suite_page
+    from gsopt.benchmark.suite import html_page, result_file, tables
 
-    document, pictures = suite_file.read(flags.json), suite_file.read_pictures(flags.json)
-    suite_page.write_page(document, flags.page)
-    suite_html.write_grid(document, pictures, flags.page.parent / "img" / f"suite-{document['suite']}.jpg")
-    suite_html.write_html(document, pictures, flags.page.with_name(f"{flags.page.stem}-{document['suite']}.html"))
+    document, pictures = result_file.read(flags.json), result_file.read_pictures(flags.json)
+    tables.write_page(document, flags.page)
+    html_page.write_grid(document, pictures, flags.page.parent / "img" / f"suite-{document['suite']}.jpg")
+    html_page.write_html(document, pictures, flags.page.with_name(f"{flags.page.stem}-{document['suite']}.html"))
 
 
 def read_threads(text: str) -> list[int]:

@@ -125,8 +125,8 @@ def measure(backend: Backend) -> float:
     """Median time of one forward and backward pass, ms."""
     import torch
 
-    from gsopt.cameras import Cameras, intrinsics, look_at
     from gsopt.gaussians import Gaussians
+    from gsopt.geometry.cameras import Cameras, intrinsics, look_at
     from gsopt.raster.backend import RasterSettings
 
     random = torch.Generator().manual_seed(0)

@@ -31,7 +31,7 @@ def main(argv: Sequence[str]) -> int:
     """Evaluate, print the means and return 0."""
     flags = tyro.cli(Flags, prog="gsopt eval", args=argv)
 
-    from gsopt.evaluation import evaluate
+    from gsopt.results.evaluation import evaluate
 
     metrics = evaluate(
         flags.run,
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     print(summary(metrics))
     print(f"Written: {flags.run / 'metrics.json'}")
     if flags.report:
-        from gsopt.report import write_report
+        from gsopt.results.report import write_report
 
         print(f"Written: {write_report(flags.run)}")
     return 0

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from gsopt.cli.sfm import say
-from gsopt.finetune.course import Course
+from gsopt.finetune.training_config import Course
 
 ON_VIEWS = "--on-views"
 """Asks for another training, with flags of its own."""

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from gsopt.cli.sfm import say
 from gsopt.cli.train import read_ids
-from gsopt.finetune.on_views.settings import Preparation, Study
+from gsopt.finetune.on_views.training_config import Preparation, Study
 
 
 def on_views(
@@ -43,7 +43,7 @@ def on_views(
         eval: As to gsopt train: hold out every 8th image when the dataset has no test split of its own.
         threads: CPU threads; 0 = all.
     """
-    from gsopt.finetune.on_views.pictures import Chosen, find_pictures
+    from gsopt.finetune.on_views.images import Chosen, find_pictures
     from gsopt.finetune.on_views.run import finetune, use_threads
 
     use_threads(threads)

@@ -44,8 +44,8 @@ def main(argv: Sequence[str]) -> int:
     if flags.size is not None:
         check.within("--size", flags.size, 1, 16384, "Drop the flag for the size of the input views.")
 
-    from gsopt.film import FILMS
-    from gsopt.render import open_run, render_film, render_stills, shots_along
+    from gsopt.results.finished_run import open_run, render_film, render_stills, shots_along
+    from gsopt.results.video import FILMS
 
     run = open_run(flags.run, flags.backend, flags.threads)
     shots = shots_along(run, flags.path, flags.frames, flags.size)

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
-from gsopt import config as settings
+from gsopt.config import train as settings
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.presets import Preset, chosen, with_preset
 from gsopt.errors import UsageError
 from gsopt.events import to_json, write_atomic
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.presets import Preset, chosen, with_preset
 
 if TYPE_CHECKING:
     from gsopt.cli.console import RunConsole
@@ -157,8 +157,8 @@ def with_poses(config: settings.TrainConfig, run: Path) -> settings.TrainConfig:
 def judge(config: settings.TrainConfig, result: TrainResult, console: RunConsole) -> None:
     """Evaluate, write the report, and end the run with the event `done` (`error` when one of these fails)."""
     from gsopt.cli.console import clock
-    from gsopt.evaluation import evaluate, read_metrics
-    from gsopt.report import write_report
+    from gsopt.results.evaluation import evaluate, read_metrics
+    from gsopt.results.report import write_report
     from gsopt.training.run_directory import opened
 
     with opened(result.run, config, resume=True, listener=console) as directory:
@@ -250,7 +250,7 @@ def guidance_config(flags: Guidance) -> GuidanceConfig:
     Raises InputError for a prompt that cannot be used, UsageError for guidance without a prior: before any work.
     """
     from gsopt.llm_prompts.schema import Prompt, accepted_images
-    from gsopt.sds.choice import choose
+    from gsopt.sds.select_prior import choose
 
     for text in (*flags.prompt, *flags.negative):
         Prompt(text)

@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
     flags = tyro.cli(Flags, prog="gsopt view", args=argv)
     check.within("--port", flags.port, 0, 65535, "Ports above 1023 need no privileges.")
 
-    from gsopt import viewer
+    from gsopt.results import viewer
 
     viewer.serve(flags.target, flags.host, flags.port, flags.once)
     return 0

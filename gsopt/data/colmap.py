@@ -18,7 +18,7 @@ from gsopt.data import files
 from gsopt.data.colmap_files import CameraRecord, ImageRecord, read_cameras, read_images, read_points
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
-from gsopt.data.source import Frame, Source, check_enough, check_pose, summarize_names
+from gsopt.data.posed_images import Frame, Source, check_enough, check_pose, summarize_names
 from gsopt.errors import InputError
 
 SUPPORTED = (

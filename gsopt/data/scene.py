@@ -9,17 +9,17 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt.cameras import Cameras
-from gsopt.config import DataConfig
+from gsopt.config.train import DataConfig
 from gsopt.data import files
 from gsopt.data.colmap import find_model, read_colmap
 from gsopt.data.images import ImageStore, Picture, read_header, size_mismatch
+from gsopt.data.posed_images import Frame, Source
 from gsopt.data.resample import downscaled_size
-from gsopt.data.source import Frame, Source
 from gsopt.data.split import split
 from gsopt.data.transforms import read_transforms
 from gsopt.data.undistort import Undistortion, choose_pinhole
 from gsopt.errors import InputError
+from gsopt.geometry.cameras import Cameras
 
 FAR_FROM_ORIGIN = 1e3
 """Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""

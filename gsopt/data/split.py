@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.config import DataConfig
-from gsopt.data.source import Frame, Source
+from gsopt.config.train import DataConfig
+from gsopt.data.posed_images import Frame, Source
 from gsopt.errors import UsageError
 
 HOLD_OUT_EVERY = 8

@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import intrinsics, viewmats_from_opengl
 from gsopt.data import files
 from gsopt.data.images import read_header
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
 from gsopt.data.pointcloud import read_points_ply
-from gsopt.data.source import Frame, Source, check_enough, read_pose, summarize_names
+from gsopt.data.posed_images import Frame, Source, check_enough, read_pose, summarize_names
 from gsopt.errors import InputError
+from gsopt.geometry.cameras import intrinsics, viewmats_from_opengl
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")

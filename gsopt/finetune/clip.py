@@ -17,11 +17,11 @@ from torch import Tensor
 
 from gsopt._optional import require
 from gsopt.finetune.captions import common_texts
-from gsopt.finetune.library import Library, Say
-from gsopt.sds.clip import LONGEST, MEAN, STD
+from gsopt.finetune.pair_cache import Library, Say
 from gsopt.sds.noise import generator
-from gsopt.sds.prior import Images
-from gsopt.sds.view_prior import TOKEN_WIDTH
+from gsopt.sds.priors.clip import LONGEST, MEAN, STD
+from gsopt.sds.priors.protocol import Images
+from gsopt.sds.priors.view_conditioned import TOKEN_WIDTH
 
 SIDE, PATCH = 64, 8
 """Of the pictures and of their patches, px."""

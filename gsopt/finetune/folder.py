@@ -12,8 +12,8 @@ import torch
 
 from gsopt.data.files import is_regular, read_json
 from gsopt.events import to_json, write_atomic
-from gsopt.finetune.course import Course
-from gsopt.sds.view_prior import CARD, STEPS
+from gsopt.finetune.training_config import Course
+from gsopt.sds.priors.view_conditioned import CARD, STEPS
 
 if TYPE_CHECKING:
     from gsopt.finetune.run import Lessons

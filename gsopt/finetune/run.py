@@ -12,22 +12,22 @@ from typing import Any
 import torch
 
 from gsopt import check
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.data.scene import is_posed
 from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
-from gsopt.finetune.course import Course
+from gsopt.finetune.caption_tokens import Told, tell
+from gsopt.finetune.evaluation import measure, sheet
 from gsopt.finetune.folder import write_folder
-from gsopt.finetune.learn import STATE, Training
-from gsopt.finetune.library import Library, Say, collect
-from gsopt.finetune.measure import measure, sheet
-from gsopt.finetune.told import Told, tell
-from gsopt.finetune.words import find_encoder, said_of_all, words_known
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.finetune.pair_cache import Library, Say, collect
+from gsopt.finetune.text_encoder import find_encoder, said_of_all, words_known
+from gsopt.finetune.trainer import STATE, Training
+from gsopt.finetune.training_config import Course
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
-from gsopt.sds.choice import EMBEDDED
-from gsopt.sds.view_prior import CARD, CLIP, ViewPrior, is_view_prior, make_deaf, make_unet, side_multiple
+from gsopt.sds.priors.view_conditioned import CARD, CLIP, ViewPrior, is_view_prior, make_deaf, make_unet, side_multiple
+from gsopt.sds.select_prior import EMBEDDED
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""

@@ -18,16 +18,16 @@ import torch
 from numpy.typing import NDArray
 
 import gsopt
-from gsopt import sh
 from gsopt.errors import InputError
 from gsopt.formats.files import opened, replacing
-from gsopt.formats.morton import morton_order
 from gsopt.formats.ply import read_splats
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import float_blocks, raw_blocks, seek_element
 from gsopt.formats.rows import BYTE_OPACITY_MARGIN, checked, logit, storable
 from gsopt.gaussians import Gaussians
-from gsopt.quats import normalize
+from gsopt.geometry import sh
+from gsopt.geometry.morton import morton_order
+from gsopt.geometry.quats import normalize
 
 CHUNK = 256
 _EXTREMES = tuple(

@@ -17,15 +17,15 @@ import torch
 from torch import Tensor
 
 import gsopt
-from gsopt import sh
 from gsopt.errors import InputError
+from gsopt.formats.axes import LEFT_UP_FORWARD, turned
 from gsopt.formats.files import opened, replacing
-from gsopt.formats.frames import LEFT_UP_FORWARD, turned
 from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Document, read_container
 from gsopt.formats.glb_splats import EXTENSION, Accessor, splat_primitives
 from gsopt.formats.rows import MAX_SH_DEGREE, checked, log_scales, logit, scales, storable, to_bytes
 from gsopt.gaussians import Gaussians
-from gsopt.quats import normalize
+from gsopt.geometry import sh
+from gsopt.geometry.quats import normalize
 
 _FLOAT, _BYTE = 5126, 5121
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsopt import sh
 from gsopt.errors import InputError
 from gsopt.formats.files import opened, read_exactly, replacing
 from gsopt.formats.rows import BYTE_OPACITY_MARGIN, checked, log_scales, logit, scales, storable, to_bytes
 from gsopt.gaussians import Gaussians
-from gsopt.quats import normalize
+from gsopt.geometry import sh
+from gsopt.geometry.quats import normalize
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _BLOCK = 1 << 16

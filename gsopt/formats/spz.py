@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsopt.errors import InputError
+from gsopt.formats.axes import RIGHT_UP_BACK, turned
 from gsopt.formats.files import opened, read_exactly, replacing
-from gsopt.formats.frames import RIGHT_UP_BACK, turned
 from gsopt.formats.inflate import GzipStream, check_ratio, deflated, unzstd, zstandard_compressed
 from gsopt.formats.rows import MAX_SH_DEGREE, checked, storable
 from gsopt.formats.spz_codes import pack, stream_sizes, unpack

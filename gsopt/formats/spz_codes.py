@@ -18,7 +18,7 @@ from torch import Tensor
 from gsopt.errors import InputError
 from gsopt.formats.rows import BYTE_OPACITY_MARGIN, logit, to_bytes
 from gsopt.gaussians import Gaussians
-from gsopt.quats import normalize
+from gsopt.geometry.quats import normalize
 
 _MAX_CODE = (1 << 23) - 1
 _FINEST = 16

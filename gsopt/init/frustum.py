@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
-from gsopt.init.rig import Focus, sees
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import Focus, sees
 
 BACKGROUND_SHARE = 0.3
 """Share of the points beyond the common region, where the scene has a background (no alpha)."""

@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
 from gsopt.data.scene import Scene
-from gsopt.init.photos import Photo, sample, small_photos
-from gsopt.init.rig import Focus, find_focus, inside, project
-from gsopt.init.rounded import rounded
-from gsopt.init.surface import unoccluded_colors
-from gsopt.init.voxels import Grid, dilated, eroded
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import Focus, find_focus, inside, project
+from gsopt.geometry.voxels import Grid, dilated, eroded
+from gsopt.init.rounded_hull import rounded
+from gsopt.init.surface_colors import unoccluded_colors
+from gsopt.init.thumbnails import Photo, sample, small_photos
 
 SURFACE_SHARE = 0.7
 """Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.init.neighbors import mean_neighbor_distance
-from gsopt.sh import sh0_from_rgb
 
 OPACITY = 0.1
 NEIGHBORS = 3

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsopt.errors import InputError, UsageError
-from gsopt.llm_prompts.clean import printable
+from gsopt.llm_prompts.sanitize import printable
 
 LARGEST_ANSWER = 4 << 20
 """Bytes of an HTTP answer that are read."""

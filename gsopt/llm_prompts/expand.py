@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, zip_longest
 
-from gsopt.llm_prompts.distinct import repeated, without_repetitions
+from gsopt.llm_prompts.deduplicate import repeated, without_repetitions
 from gsopt.llm_prompts.schema import LONGEST_TEXT, Prompt, View
 from gsopt.llm_prompts.subject import WORD, content, stem, with_article
 from gsopt.llm_prompts.templates import Template, fill

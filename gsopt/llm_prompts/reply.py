@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from gsopt._optional import require
-from gsopt.llm_prompts.clean import OTHER_VIEW, Unusable, cleaned, cleaned_rationale
-from gsopt.llm_prompts.distinct import repeated
+from gsopt.llm_prompts.deduplicate import repeated
 from gsopt.llm_prompts.expand import Wish
+from gsopt.llm_prompts.sanitize import OTHER_VIEW, Unusable, cleaned, cleaned_rationale
 from gsopt.llm_prompts.schema import Prompt, View
 from gsopt.llm_prompts.subject import names
 from gsopt.llm_prompts.tokens import LONGEST, Counter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from gsopt.llm_prompts.clean import LONGEST_CHARACTERS
+from gsopt.llm_prompts.sanitize import LONGEST_CHARACTERS
 
 
 class EntryModel(BaseModel):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 from gsopt.errors import InputError
-from gsopt.llm_prompts.clean import printable
+from gsopt.llm_prompts.sanitize import printable
 from gsopt.llm_prompts.schema import LONGEST_TEXT, Picture, Prompt, PromptSet, View
 
 HELP = (

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gsopt import check
-from gsopt.cameras import Cameras
 from gsopt.errors import InputError, MissingDependency
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.autograd import draw
 from gsopt.raster.backend import Backend, RasterSettings
 

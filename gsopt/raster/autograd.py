@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsopt.cameras import Cameras
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Backend, RasterSettings
 
 Image = tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"], Float[Tensor, "H W"] | None, Int[Tensor, "N 2"]]

@@ -27,8 +27,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gsopt import check
-from gsopt.cameras import Cameras
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras
 
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99

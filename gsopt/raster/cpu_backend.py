@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
 from gsopt.errors import NumericalError, UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.backend import AdamStep, Frame, Gradients, Photometric, RasterSettings
 

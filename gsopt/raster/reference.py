@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gsopt import quats as quaternions
-from gsopt import sh
-from gsopt.cameras import Cameras
 from gsopt.errors import UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry import quats as quaternions
+from gsopt.geometry import sh
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import (
     ALPHA_MAX,
     ALPHA_MIN,

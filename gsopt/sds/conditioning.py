@@ -24,7 +24,7 @@ from torch import Tensor
 from gsopt.errors import InputError
 from gsopt.events import write_atomic
 from gsopt.llm_prompts.schema import Prompt, prompts_document, prompts_from
-from gsopt.sds.prior import Encoder, Images
+from gsopt.sds.priors.protocol import Encoder, Images
 
 VERSION = 1
 WORDS = {"front": "front view", "side": "side view", "back": "back view", "top": "overhead view"}

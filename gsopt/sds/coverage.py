@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
 from gsopt.data.split import farthest_points
 from gsopt.gaussians import Gaussians
-from gsopt.init.rig import inside, project
-from gsopt.quats import rotation_matrices
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import inside, project
+from gsopt.geometry.quats import rotation_matrices
+from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, RasterSettings
-from gsopt.sh import sh0_from_rgb
 
 MOST_VIEWS = 32
 """Input views that are looked through, the farthest apart: coverage saturates long before."""

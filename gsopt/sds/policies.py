@@ -28,7 +28,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.sds.noise import Latents, Signal, add_noise, eps_from, weight
-from gsopt.sds.prior import Images, Pair, Prior, Scale, guided_x0
+from gsopt.sds.priors.protocol import Images, Pair, Prior, Scale, guided_x0
 
 ROUND = 0.01
 """Differences well below this count by their square: no gradient jumps where the render has arrived."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gsopt.guidance_config import GuidanceConfig, sure
+from gsopt.config.guidance import GuidanceConfig, sure
 
 # Configurations here are settled ones (`guidance_config.settled`): nothing in them is left open.
 

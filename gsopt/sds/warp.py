@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
-from gsopt.init.rig import inside, project
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import inside, project
 
 DEPTH_SLACK = 0.02
 

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.init.photos import Photo
-from gsopt.init.surface import seen_colors
-from gsopt.init.voxels import Grid
+from gsopt.geometry.voxels import Grid
+from gsopt.init.surface_colors import seen_colors
+from gsopt.init.thumbnails import Photo
 from gsopt.symmetry.mirror import Mirror
 
 NEAR = 0.1

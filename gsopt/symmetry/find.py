@@ -10,10 +10,10 @@ import torch
 
 from gsopt.data.scene import Scene, View
 from gsopt.errors import InputError
+from gsopt.geometry.projection import find_focus
+from gsopt.geometry.voxels import Grid
 from gsopt.init.hull import carve, in_hull
-from gsopt.init.photos import Photo, small_photos
-from gsopt.init.rig import find_focus
-from gsopt.init.voxels import Grid
+from gsopt.init.thumbnails import Photo, small_photos
 from gsopt.symmetry.colors import disagreement
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.search import Ball, bounding_ball, candidates, refined, same

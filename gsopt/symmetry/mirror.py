@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
+from gsopt.geometry.cameras import Cameras
 
 
 @dataclass(frozen=True)

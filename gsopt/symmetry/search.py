@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gsopt.init.photos import Photo
-from gsopt.init.rig import inside, project
-from gsopt.init.voxels import Grid, dilated
+from gsopt.geometry.projection import inside, project
+from gsopt.geometry.voxels import Grid, dilated
+from gsopt.init.thumbnails import Photo
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import Silhouettes
 

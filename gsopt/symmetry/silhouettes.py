@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gsopt.init.photos import Photo, sample
-from gsopt.init.rig import project
-from gsopt.init.rounded import squared_distance
+from gsopt.geometry.projection import project
+from gsopt.init.rounded_hull import squared_distance
+from gsopt.init.thumbnails import Photo, sample
 from gsopt.symmetry.mirror import Mirror
 
 RAYS = 120

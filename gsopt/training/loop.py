@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from gsopt.config import TrainConfig
+from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
@@ -23,9 +23,9 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.training import schedule
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
-from gsopt.training.guard import require_finite, require_finite_loss
-from gsopt.training.guidance import RunGuidance
-from gsopt.training.guided_run import start_guidance
+from gsopt.training.finite import require_finite, require_finite_loss
+from gsopt.training.guided.session import RunGuidance
+from gsopt.training.guided.start import start_guidance
 from gsopt.training.interrupt import StopRequest
 from gsopt.training.mirrors import with_recorded_mirrors
 from gsopt.training.run_directory import Listener, RunDirectory, opened

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsopt.config import TrainConfig
+from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.symmetry.find import Symmetry, find_symmetries, with_mirror_images

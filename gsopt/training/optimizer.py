@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsopt.cameras import Cameras
-from gsopt.config import OptimizerConfig
+from gsopt.config.train import OptimizerConfig
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import AdamStep, Backend, Gradients, RasterSettings
 
 

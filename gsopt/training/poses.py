@@ -18,11 +18,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsopt import quats, sh
-from gsopt.cameras import Cameras
-from gsopt.config import PoseConfig
+from gsopt.config.train import PoseConfig
 from gsopt.data.scene import Scene
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import quats, sh
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Gradients
 
 TENSORS = ("viewmats", "whitening", "exp_avg", "exp_avg_sq", "steps")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt import __version__
-from gsopt.config import TrainConfig
+from gsopt.config.train import TrainConfig
 from gsopt.errors import GsoptError, InputError, UsageError
 from gsopt.events import EventWriter, to_json, write_atomic
 

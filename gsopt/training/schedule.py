@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from gsopt.config import MOST_GAUSSIANS, DensityConfig, OptimizerConfig, TrainConfig
+from gsopt.config.train import MOST_GAUSSIANS, DensityConfig, OptimizerConfig, TrainConfig
 
 # Published end of refinement (Kerbl et al. 2023; Kheradmand et al. 2024), and its share of a shorter run.
 REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}

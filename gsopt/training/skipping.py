@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gsopt import sh
-from gsopt.cameras import Cameras
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import sh
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Gradients
 
 

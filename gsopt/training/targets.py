@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt.cameras import Cameras
 from gsopt.data.resample import area_downscale, downscaled_size, premultiply
 from gsopt.data.scene import View
+from gsopt.geometry.cameras import Cameras
 from gsopt.training.window import content_window
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
-from gsopt.config import TrainConfig
+from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.training import schedule
 from gsopt.training.checkpoint import Checkpoint
@@ -30,7 +30,7 @@ from gsopt.training.targets import BACKGROUNDS, Target, Targets, content_pixels
 from gsopt.training.window import draws_whole
 
 if TYPE_CHECKING:
-    from gsopt.training.guidance import RunGuidance
+    from gsopt.training.guided.session import RunGuidance
 
 # The PSNR that is shown is taken every so many steps: the mean squared error costs a pass over the image.
 PSNR_EVERY = 10

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.cameras import Cameras
+from gsopt.geometry.cameras import Cameras
 
 # Around the opaque pixels: SSIM's window reaches 5 px, and splats that stick out must feel the background.
 MARGIN = 16

@@ -16,7 +16,7 @@ HEAVY = {"torch", "numpy", "PIL", "jaxtyping", "diffusers", "transformers", "vis
         "import gsopt; dir(gsopt); gsopt.GsoptError; gsopt.TrainConfig",
         "import gsopt.cli; assert gsopt.cli.main(['--help']) == 0",
         "import gsopt.cli; assert gsopt.cli.main(['--version']) == 0",
-        "import gsopt.config, gsopt.errors, gsopt.events, gsopt.check, gsopt._optional",
+        "import gsopt.config.train, gsopt.errors, gsopt.events, gsopt.check, gsopt._optional",
     ],
 )
 def test_the_bottom_row_and_help_load_nothing_heavy(clean_python, code: str) -> None:

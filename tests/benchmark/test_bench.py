@@ -100,7 +100,7 @@ def test_what_departs_from_the_schema_is_not_written(measured: Path, tmp_path: P
 
 
 def test_the_committed_results_keep_the_schema() -> None:
-    results.read(ROOT / "benchmarks" / "results" / "kernels.json")
+    results.read(ROOT / "experiments" / "results" / "kernels.json")
 
 
 def test_a_page_is_drawn_from_the_file_alone(measured: Path, tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from gsopt import cli
 from gsopt.benchmark import results, schema
 from gsopt.benchmark.scenes import Task, front, time_at
 from gsopt.cli import bench
-from gsopt.config import DataConfig
+from gsopt.config.presets import PRESETS
+from gsopt.config.train import DataConfig
 from gsopt.errors import InputError, UsageError
-from gsopt.presets import PRESETS
 from gsopt.training.schedule import shortened
 
 

@@ -16,58 +16,58 @@ from hypothesis import strategies as st
 from suite_records import MACHINE, record
 
 from gsopt import cli
-from gsopt.benchmark import suite, suite_arms, suite_file, suite_html, suite_key, suite_page, suite_stats
+from gsopt.benchmark.suite import aggregate, arm_flags, definition, html_page, result_file, run_key, tables
 from gsopt.errors import InputError, UsageError
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMITTED = sorted((ROOT / "benchmarks" / "results").glob("suite-*.json"))
+COMMITTED = sorted((ROOT / "experiments" / "results").glob("suite-*.json"))
 
 
 def document(*records: dict[str, Any], name: str = "sparse") -> dict[str, Any]:
-    made = suite_file.empty(name, "gsopt bench")
+    made = result_file.empty(name, "gsopt bench")
     for one in records:
-        made = suite_file.with_run(made, one, MACHINE, "protocol; background white")
+        made = result_file.with_run(made, one, MACHINE, "protocol; background white")
     return made
 
 
 # Declarations
 
 
-@pytest.mark.parametrize("name", suite.SUITES)
+@pytest.mark.parametrize("name", definition.SUITES)
 def test_a_suite_declares_runs_that_differ_and_arms_that_exist(name: str) -> None:
-    cases = list(suite.cases(suite.load(name), 2))
+    cases = list(definition.cases(definition.load(name), 2))
     assert len({case.id for case in cases}) == len(cases) > 0
-    assert {case.arm for case in cases} <= set(suite_arms.ARMS)
+    assert {case.arm for case in cases} <= set(arm_flags.ARMS)
     for case in cases:
         assert (case.flags.count("--iterations"), case.flags.count("--seed")) == (1, 1)
         assert case.flags[case.flags.index("--iterations") + 1] == str(case.iterations)
 
 
 def test_the_first_seed_of_everything_comes_before_the_second() -> None:
-    seeds = [case.seed for case in suite.cases(suite.load("sparse"), 3)]
+    seeds = [case.seed for case in definition.cases(definition.load("sparse"), 3)]
     assert seeds == sorted(seeds)
 
 
 def test_views_are_a_number_ids_or_all() -> None:
-    whole = suite.load("sparse")
+    whole = definition.load("sparse")
     group = replace(whole.groups[0], views=("4", "2,16", "all"), scenes=("a",), runs=(("ours", 5),))
-    flags = [case.flags for case in suite.cases(replace(whole, groups=(group,)), 1)]
+    flags = [case.flags for case in definition.cases(replace(whole, groups=(group,)), 1)]
     tail = ("--iterations", "5", "--seed", "0")
     assert flags == [("--views", "4", *tail), ("--view-ids", "2,16", *tail), tail]
-    assert [suite.view_count(views) for views in group.views] == ["4", "2", "all"]
+    assert [definition.view_count(views) for views in group.views] == ["4", "2", "all"]
 
 
 def test_the_published_settings_are_defined_once() -> None:
-    source = (ROOT / "benchmarks" / "scenes.py").read_text()
+    source = (ROOT / "experiments" / "scenes.py").read_text()
     assert "import PLAIN" in source
     assert "1.25e-4" not in source
-    assert suite_arms.ARMS["3dgs"] == suite_arms.PLAIN
+    assert arm_flags.ARMS["3dgs"] == arm_flags.PLAIN
 
 
 @pytest.mark.parametrize("text", ["", "groups = 3\ntitle='a'\nabout='b'", "title = ", "[[groups]]\nname = 'x'"])
 def test_a_broken_declaration_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        suite.parse(text, "mine")
+        definition.parse(text, "mine")
 
 
 # Refusals of the command line
@@ -99,7 +99,7 @@ def test_what_cannot_be_run_is_refused_before_anything_is_written(
         ("[]", 3, "must hold a JSON object"),
         ("{}", 3, "must hold results of a suite"),
         ('{"suite": "smoke"}', 3, "must be the keys"),
-        (suite_file.compact(suite_file.empty("paper", "c")).decode(), 2, "holds results of the suite paper"),
+        (result_file.compact(result_file.empty("paper", "c")).decode(), 2, "holds results of the suite paper"),
     ],
 )
 def test_a_result_file_of_something_else_is_refused_and_left_alone(
@@ -116,10 +116,10 @@ def test_a_result_file_of_something_else_is_refused_and_left_alone(
 
 
 def test_the_key_changes_with_settings_data_and_code() -> None:
-    base = suite_key.key(["--a", "1"], "data", "code")
-    assert base == suite_key.key(["--a", "1"], "data", "code")
+    base = run_key.key(["--a", "1"], "data", "code")
+    assert base == run_key.key(["--a", "1"], "data", "code")
     others = [(["--a", "2"], "data", "code"), (["--a", "1"], "other", "code"), (["--a", "1"], "data", "other")]
-    assert len({base, *(suite_key.key(*other) for other in others), suite_key.key(["--a1"], "data", "code")}) == 5
+    assert len({base, *(run_key.key(*other) for other in others), run_key.key(["--a1"], "data", "code")}) == 5
 
 
 def test_data_is_names_and_bytes(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_data_is_names_and_bytes(tmp_path: Path) -> None:
         for name, data in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)
-        return suite_key.folder_hash(folder)
+        return run_key.folder_hash(folder)
 
     base = hashed({"a/b": b"1", "c": b"23"})
     assert base == hashed({"c": b"23", "a/b": b"1"})
@@ -138,29 +138,29 @@ def test_data_is_names_and_bytes(tmp_path: Path) -> None:
 
 def test_code_is_what_takes_part_in_a_run_and_not_what_draws_it(tmp_path: Path) -> None:
     def hashed(changed: str = "") -> str:
-        suite_key.code_hash.cache_clear()
+        run_key.code_hash.cache_clear()
         for name in (
             "losses.py",
             "raster/_cpu.so",
             "weights/w.npz",
-            "report/page.py",
-            "benchmark/suite_page.py",
+            "results/report/page.py",
+            "benchmark/suite/tables.py",
             "x.md",
         ):
-            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).write_text("changed" if name == changed else "")
-        return suite_key.code_hash(tmp_path)
+        return run_key.code_hash(tmp_path)
 
     base = hashed()
     matters = {hashed(name) for name in ("losses.py", "raster/_cpu.so", "weights/w.npz")}
     assert len(matters | {base}) == 4
-    assert {hashed(name) for name in ("report/page.py", "benchmark/suite_page.py", "x.md")} == {base}
-    suite_key.code_hash.cache_clear()
+    assert {hashed(name) for name in ("results/report/page.py", "benchmark/suite/tables.py", "x.md")} == {base}
+    run_key.code_hash.cache_clear()
 
 
 def test_what_only_draws_exists() -> None:
-    package = suite_key.PACKAGE
-    assert all((package / name).exists() for name in (*suite_key.DRAWING, *suite_key.DRAWING_TOO))
+    package = run_key.PACKAGE
+    assert all((package / name).exists() for name in run_key.DRAWING)
 
 
 # Statistics
@@ -168,15 +168,15 @@ def test_what_only_draws_exists() -> None:
 
 @pytest.mark.parametrize(("degrees", "t"), [(1, 12.7062), (2, 4.3027), (3, 3.1824), (10, 2.2281), (30, 2.0423)])
 def test_quantiles_of_students_t_are_those_of_printed_tables(degrees: int, t: float) -> None:
-    assert suite_stats.t_quantile(0.975, degrees) == pytest.approx(t, abs=5e-5)
-    assert suite_stats.t_share(t, degrees) == pytest.approx(0.95, abs=1e-5)
+    assert aggregate.t_quantile(0.975, degrees) == pytest.approx(t, abs=5e-5)
+    assert aggregate.t_share(t, degrees) == pytest.approx(0.95, abs=1e-5)
 
 
 def test_a_paired_interval_is_the_one_computed_by_hand() -> None:
     # Differences +1, +2, +3, +6: mean 3, deviation sqrt(14 / 3) = 2.160247, its error 1.080123, t(3) = 3.182446.
     pairs = [("a", 20, 21), ("b", 25, 27), ("c", 22, 25), ("d", 30, 36)]
     runs = [record("3dgs", low, scene) for scene, low, _ in pairs] + [record("ours", high, s) for s, _, high in pairs]
-    found = suite_stats.summarized(suite_stats.differences(runs, ("ours", 2000), ("3dgs", 2000), "psnr"))
+    found = aggregate.summarized(aggregate.differences(runs, ("ours", 2000), ("3dgs", 2000), "psnr"))
     assert found is not None
     assert (found.mean, found.lowest, found.highest, found.positive, found.count) == (3, 1, 6, 4, 4)
     assert found.half == pytest.approx(3.182446 * 1.080123, abs=1e-5)
@@ -185,15 +185,15 @@ def test_a_paired_interval_is_the_one_computed_by_hand() -> None:
 def test_seeds_of_a_scene_are_averaged_before_scenes_are_compared() -> None:
     runs = [record("3dgs", 20, scene, seed) for scene in "ab" for seed in (0, 1)]
     runs += [record("ours", 20 + 1, "a", 0), record("ours", 20 + 3, "a", 1), record("ours", 20 - 1, "b", 0)]
-    assert suite_stats.differences(runs, ("ours", 2000), ("3dgs", 2000), "psnr") == [2, -1]
+    assert aggregate.differences(runs, ("ours", 2000), ("3dgs", 2000), "psnr") == [2, -1]
     alone = [run for run in runs if run["scene"] == "a"]
-    assert suite_stats.differences(alone, ("ours", 2000), ("3dgs", 2000), "psnr") == [1, 3]
+    assert aggregate.differences(alone, ("ours", 2000), ("3dgs", 2000), "psnr") == [1, 3]
 
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-5, 5), min_size=2, max_size=9), st.floats(-3, 3))
 def test_a_shift_of_all_values_shifts_the_mean_and_leaves_the_interval(values: list[float], shift: float) -> None:
-    one, other = suite_stats.summarized(values), suite_stats.summarized([value + shift for value in values])
+    one, other = aggregate.summarized(values), aggregate.summarized([value + shift for value in values])
     assert one is not None
     assert other is not None
     assert other.mean == pytest.approx(one.mean + shift, abs=1e-9)
@@ -203,26 +203,26 @@ def test_a_shift_of_all_values_shifts_the_mean_and_leaves_the_interval(values: l
 
 def test_seconds_to_a_quality_lie_on_the_course() -> None:
     course = [{"cpu_seconds": 10.0, "psnr": 20.0}, {"cpu_seconds": 30.0, "psnr": 24.0}]
-    assert [suite_stats.seconds_to(course, psnr) for psnr in (19, 20, 21, 24, 25)] == [10, 10, 15, 30, None]
+    assert [aggregate.seconds_to(course, psnr) for psnr in (19, 20, 21, 24, 25)] == [10, 10, 15, 30, None]
     runs = [record("3dgs", 20), record("ours", 21), record("ours", 22, "b")]
-    assert suite_stats.reached(runs, ("ours", 2000), ("3dgs", 2000)) == ([7.5], 1)
+    assert aggregate.reached(runs, ("ours", 2000), ("3dgs", 2000)) == ([7.5], 1)
 
 
 def test_a_mean_course_leaves_out_looks_that_some_run_lacks() -> None:
     short = record("ours", 20)
     short["curve"] = short["curve"][1:]
-    assert suite_stats.mean_curve([short, record("ours", 22, "b")], "psnr") == [(10, 21)]
+    assert aggregate.mean_curve([short, record("ours", 22, "b")], "psnr") == [(10, 21)]
 
 
 # Result files and pages
 
 
 def test_a_run_replaces_its_older_record_and_an_entry_among_the_skipped() -> None:
-    named = {name: record("ours", 20)[name] for name in suite_file.ID}
-    made = suite_file.with_skip(document(record("3dgs", 19)), {**named, "reason": "no prior"})
+    named = {name: record("ours", 20)[name] for name in result_file.ID}
+    made = result_file.with_skip(document(record("3dgs", 19)), {**named, "reason": "no prior"})
     assert [skip["arm"] for skip in made["skipped"]] == ["ours"]
-    made = suite_file.with_run(made, record("ours", 21), {**MACHINE, "cpu": "other"}, "protocol; background white")
-    made = suite_file.with_run(made, record("ours", 22), {**MACHINE, "load": 2.0}, "another")
+    made = result_file.with_run(made, record("ours", 21), {**MACHINE, "cpu": "other"}, "protocol; background white")
+    made = result_file.with_run(made, record("ours", 22), {**MACHINE, "load": 2.0}, "another")
     assert [(run["arm"], run["mean"]["psnr"], run["machine"], run["protocol"]) for run in made["runs"]] == [
         ("3dgs", 19, 0, 0),
         ("ours", 22, 0, 1),
@@ -234,23 +234,23 @@ def test_a_run_replaces_its_older_record_and_an_entry_among_the_skipped() -> Non
 def test_a_file_is_read_as_it_was_written_and_nothing_half_done_reaches_it(tmp_path: Path) -> None:
     file = tmp_path / "r.json"
     made = document(record("ours", 20))
-    suite_file.write(file, made)
-    assert suite_file.read(file) == made
+    result_file.write(file, made)
+    assert result_file.read(file) == made
     before = file.read_bytes()
     broken = document({**record("ours", 20), "key": 3})
     with pytest.raises(InputError, match="must be str, got '3'"):
-        suite_file.write(file, broken)
+        result_file.write(file, broken)
     with pytest.raises(ValueError, match="not JSON compliant"):
-        suite_file.compact({"a": math.nan})
+        result_file.compact({"a": math.nan})
     assert file.read_bytes() == before
     assert len(before.splitlines()) == 2 + 2 + 3 * 3 + 2 * 1  # braces, texts, three lists of one record, two scalars
 
 
 def test_two_writers_of_one_file_are_refused(tmp_path: Path) -> None:
     with (
-        suite_file.locked(tmp_path / "r.json"),
+        result_file.locked(tmp_path / "r.json"),
         pytest.raises(UsageError, match="one writer"),
-        suite_file.locked(tmp_path / "r.json"),
+        result_file.locked(tmp_path / "r.json"),
     ):
         pass
 
@@ -259,7 +259,7 @@ def page_of(made: dict[str, Any], folder: Path) -> str:
     page = folder / "results.md"
     page.write_text("above\n<!-- begin sparse -->\nold\n<!-- end sparse -->\nbelow\n")
     file = folder / "r.json"
-    suite_file.write(file, made)
+    result_file.write(file, made)
     assert cli.main(["bench", "draw", "--json", str(file), "--page", str(page)]) == 0
     return page.read_text()
 
@@ -300,7 +300,7 @@ def test_an_arm_that_lacks_scenes_does_not_narrow_the_others() -> None:
         record(arm, 20.0 + i, scene) for i, arm in enumerate(("3dgs", "ours-0")) for scene in ("objects/a", "objects/b")
     ]
     runs.append(record("ours-llm", 30.0, "objects/b"))
-    made = suite_page.part(suite.load("sparse"), suite.load("sparse").groups[0], "4", runs)
+    made = tables.part(definition.load("sparse"), definition.load("sparse").groups[0], "4", runs)
     note, (_, rows) = made.tables[0]
     assert [row[:3] for row in rows] == [["3dgs, 2,000", "2", "20.00"], ["ours-0, 2,000", "2", "21.00"]]
     assert "ours-llm" in note
@@ -324,8 +324,8 @@ def test_rows_of_scenes_are_of_the_seeds_that_all_arms_have(tmp_path: Path) -> N
 
 
 def test_a_page_says_why_an_arm_was_left_out_and_that_versions_differ(tmp_path: Path) -> None:
-    named = {name: record("ours-user", 20)[name] for name in suite_file.ID}
-    made = suite_file.with_skip(
+    named = {name: record("ours-user", 20)[name] for name in result_file.ID}
+    made = result_file.with_skip(
         document(record("3dgs", 20), {**record("ours", 20), "code": "d"}), {**named, "reason": "r!"}
     )
     text = page_of(made, tmp_path)
@@ -336,20 +336,20 @@ def test_a_page_says_why_an_arm_was_left_out_and_that_versions_differ(tmp_path: 
 def test_the_page_of_pictures_loads_nothing_and_repeats_no_markup() -> None:
     made = document(record("3dgs", 20, "objects/oakChair"))
     bad = {"view": "<b>", "input": "https://example.org/x.webp", "truth": '"><script>'}
-    html = suite_html.page(made, {"objects/oakChair|4": bad})
+    html = html_page.page(made, {"objects/oakChair|4": bad})
     assert "example.org" not in html
     assert "<script" not in html
     with pytest.raises(InputError, match="cannot be read"):
-        suite_html.decoded("data:image/webp;base64,AAAA")
+        html_page.decoded("data:image/webp;base64,AAAA")
 
 
 @pytest.mark.parametrize("file", COMMITTED, ids=lambda path: path.stem)
 def test_the_committed_results_keep_the_schema_and_name_no_folder(file: Path) -> None:
     if file.stem.endswith("-pictures"):
         pictures = json.loads(file.read_text())
-        assert all(suite_html.decoded(value["error"]).size for value in pictures.values() if "error" in value)
+        assert all(html_page.decoded(value["error"]).size for value in pictures.values() if "error" in value)
         return
-    made = suite_file.read(file)
-    assert suite_page.parts(made)
+    made = result_file.read(file)
+    assert tables.parts(made)
     assert file.stat().st_size < 1_000_000
     assert not re.search(r"\s/\w", made["command"])

@@ -18,17 +18,18 @@ from finished_runs import FOV, HEIGHT, WHITE, WIDTH, ring, splats
 from PIL import Image
 from suite_records import MACHINE, record
 
-from gsopt import cli, quats
-from gsopt.benchmark import suite, suite_bench, suite_file, suite_judge, suite_key, suite_run
-from gsopt.benchmark.suite_run import Bench, RunFailed
+from gsopt import cli
+from gsopt.benchmark.suite import definition, result_file, run_figures, run_key, runner, single_run
+from gsopt.benchmark.suite.single_run import Bench, RunFailed
 from gsopt.data.scene import load_scene
+from gsopt.geometry import quats
 from gsopt.llm_prompts.schema import Prompt, PromptSet, write_set
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.render import draw
+from gsopt.results.finished_run import draw
 
 CASES = [
-    suite.Case("objects-4", f"objects/{name}", "4", arm, 2000, 0, ("--lambda-sds", "0", name, arm))
+    definition.Case("objects-4", f"objects/{name}", "4", arm, 2000, 0, ("--lambda-sds", "0", name, arm))
     for name in ("a", "b")
     for arm in ("3dgs", "ours-0")
 ]
@@ -46,7 +47,7 @@ def bench(tmp_path: Path) -> Bench:
     for name in ("a", "b"):
         (tmp_path / "root" / "objects" / name).mkdir(parents=True)
         (tmp_path / "root" / "objects" / name / "image.png").write_text(name)
-    suite_key.folder_hash.cache_clear()
+    run_key.folder_hash.cache_clear()
     return Bench(tmp_path / "root", tmp_path / "r-runs", 1)
 
 
@@ -55,19 +56,19 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Ids of the runs made, in order: training is replaced by a record with the case's name in it."""
     ids: list[str] = []
 
-    def measure(case: suite.Case, bench: Bench) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    def measure(case: definition.Case, bench: Bench) -> tuple[dict[str, Any], str, dict[str, Any]]:
         ids.append(case.id)
-        named = {**record(case.arm, 20.0, case.scene, case.seed), "key": suite_run.key(case, bench)}
+        named = {**record(case.arm, 20.0, case.scene, case.seed), "key": single_run.key(case, bench)}
         return named, "protocol", {case.id: {"render": "r"}}
 
-    monkeypatch.setattr(suite_run, "measure", measure)
-    monkeypatch.setattr(suite_bench, "machine", lambda: MACHINE)
+    monkeypatch.setattr(single_run, "measure", measure)
+    monkeypatch.setattr(runner, "machine", lambda: MACHINE)
     return ids
 
 
-def go(tmp_path: Path, bench: Bench, cases: list[suite.Case] = CASES) -> list[str]:
-    suite_key.folder_hash.cache_clear()
-    return suite_bench.run_suite(tmp_path / "r.json", "sparse", "c", cases, bench, lambda text: None)
+def go(tmp_path: Path, bench: Bench, cases: list[definition.Case] = CASES) -> list[str]:
+    run_key.folder_hash.cache_clear()
+    return runner.run_suite(tmp_path / "r.json", "sparse", "c", cases, bench, lambda text: None)
 
 
 def test_nothing_is_made_twice(tmp_path: Path, bench: Bench, made: list[str]) -> None:
@@ -77,7 +78,7 @@ def test_nothing_is_made_twice(tmp_path: Path, bench: Bench, made: list[str]) ->
     assert (tmp_path / "r.json").read_bytes() == before
     go(tmp_path, bench)
     assert made == [case.id for case in CASES]
-    assert set(suite_file.read_pictures(tmp_path / "r.json")) == set(made)
+    assert set(result_file.read_pictures(tmp_path / "r.json")) == set(made)
 
 
 @pytest.mark.parametrize("what", ["settings", "data", "code"])
@@ -91,11 +92,11 @@ def test_what_changed_is_made_again_and_replaces_its_record(
     elif what == "data":
         (bench.root / "objects" / "b" / "image.png").write_text("changed")
     else:
-        monkeypatch.setattr(suite_key, "code_hash", lambda: "other")
+        monkeypatch.setattr(run_key, "code_hash", lambda: "other")
     go(tmp_path, bench, cases)
     again = {"settings": cases[1:2], "data": cases[2:], "code": cases}[what]
     assert made[4:] == [case.id for case in again]
-    assert len(suite_file.read(tmp_path / "r.json")["runs"]) == 4
+    assert len(result_file.read(tmp_path / "r.json")["runs"]) == 4
 
 
 @pytest.mark.parametrize("stage", ["measure", "write", "write_pictures", "replace"])
@@ -104,7 +105,7 @@ def test_a_kill_loses_at_most_the_run_being_made(
     tmp_path: Path, bench: Bench, made: list[str], stage: str, number: int
 ) -> None:
     """Killed in a run, before or while its record is written, before its pictures are."""
-    owner: Any = {"measure": suite_run, "write": suite_file, "write_pictures": suite_file, "replace": None}[stage]
+    owner: Any = {"measure": single_run, "write": result_file, "write_pictures": result_file, "replace": None}[stage]
     with pytest.MonkeyPatch.context() as patch:
         if owner is None:
             patch.setattr("os.replace", after(number * 2, shutil.move))  # pictures, then the record
@@ -112,13 +113,13 @@ def test_a_kill_loses_at_most_the_run_being_made(
             patch.setattr(owner, stage, after(number, getattr(owner, stage)))
         with pytest.raises(Killed):
             go(tmp_path, bench)
-    kept = suite_file.read(tmp_path / "r.json")["runs"] if number else []
-    assert [suite_file.run_id(run) for run in kept] == [case.id for case in CASES[:number]]
+    kept = result_file.read(tmp_path / "r.json")["runs"] if number else []
+    assert [result_file.run_id(run) for run in kept] == [case.id for case in CASES[:number]]
     done = len(made)
     (bench.work / "run-killed").mkdir(parents=True, exist_ok=True)
     go(tmp_path, bench)
     assert made[done:] == [case.id for case in CASES[number:]]
-    assert len(suite_file.read(tmp_path / "r.json")["runs"]) == 4
+    assert len(result_file.read(tmp_path / "r.json")["runs"]) == 4
     assert not (bench.work / "run-killed").exists()
 
 
@@ -138,17 +139,17 @@ def after(count: int, real: Callable[..., Any]) -> Callable[..., Any]:
 def test_a_run_that_fails_is_told_and_the_others_are_made(
     tmp_path: Path, bench: Bench, made: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = suite_run.measure
+    real = single_run.measure
 
-    def measure(case: suite.Case, bench: Bench) -> Any:
+    def measure(case: definition.Case, bench: Bench) -> Any:
         if case is CASES[1]:
             raise RunFailed("`x` ended with exit code 4. Mend that.")
         return real(case, bench)
 
-    monkeypatch.setattr(suite_run, "measure", measure)
+    monkeypatch.setattr(single_run, "measure", measure)
     assert go(tmp_path, bench) == [CASES[1].id]
     assert len(made) == 3
-    monkeypatch.setattr(suite_run, "measure", real)
+    monkeypatch.setattr(single_run, "measure", real)
     assert go(tmp_path, bench) == []
     assert made[3:] == [CASES[1].id]
 
@@ -158,7 +159,7 @@ def test_a_record_outlives_a_machine_that_cannot_make_it(
 ) -> None:
     go(tmp_path, bench)
     before = (tmp_path / "r.json").read_bytes()
-    monkeypatch.setattr(suite_run, "reason_to_skip", lambda case, bench: "no prior at hand")
+    monkeypatch.setattr(single_run, "reason_to_skip", lambda case, bench: "no prior at hand")
     go(tmp_path, bench)
     assert (tmp_path / "r.json").read_bytes() == before
 
@@ -166,7 +167,7 @@ def test_a_record_outlives_a_machine_that_cannot_make_it(
 def test_training_that_fails_says_why(tmp_path: Path, bench: Bench) -> None:
     bench.work.mkdir()
     with pytest.raises(RunFailed, match=r"exit code 2: .*--iterations.*at least 1, got 0"):
-        suite_run.call(["train", "x", "-m", str(tmp_path / "run"), "--iterations", "0"], tmp_path / "log")
+        single_run.call(["train", "x", "-m", str(tmp_path / "run"), "--iterations", "0"], tmp_path / "log")
 
 
 # What is looked at beside metrics.json
@@ -181,12 +182,12 @@ def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the
         asked.append(arguments)
         write_set(Path(arguments[arguments.index("-o") + 1]), PromptSet((Prompt("a cup", source="llm:m"),)))
 
-    monkeypatch.setattr(suite_run, "call", call)
+    monkeypatch.setattr(single_run, "call", call)
     note = {"notes": "a cup", "domain": "cups.md"}
     (bench.root / "notes.json").write_text(json.dumps({"objects/a": note}))
     (bench.root / "cups.md").write_text("")
     case = replace(CASES[0], arm="ours-llm")
-    first, again, other = (suite_run.prompts(case, replace(bench, llm="http://x", model=m)) for m in ("m", "m", "n"))
+    first, again, other = (single_run.prompts(case, replace(bench, llm="http://x", model=m)) for m in ("m", "m", "n"))
     assert first == again != other
     assert [arguments[arguments.index("--model") + 1] for arguments in asked] == ["m", "n"]
     assert asked[0][asked[0].index("--domain") + 1] == str(bench.root / "cups.md")
@@ -194,32 +195,32 @@ def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the
 
 def test_overlap_of_silhouettes() -> None:
     a, b = torch.zeros(4, 4, dtype=torch.bool), torch.zeros(4, 4, dtype=torch.bool)
-    assert suite_judge.overlap(a, b) == 1
+    assert run_figures.overlap(a, b) == 1
     a[:2], b[1:3] = True, True
-    assert suite_judge.overlap(a, b) == pytest.approx(4 / 12, abs=1e-6)
+    assert run_figures.overlap(a, b) == pytest.approx(4 / 12, abs=1e-6)
 
 
 def test_depth_is_read_where_it_fits_and_is_a_plain_array(tmp_path: Path) -> None:
     (tmp_path / "depth").mkdir()
     view: Any = SimpleNamespace(name="images/v.png", camera=SimpleNamespace(width=3, height=2))
     file = tmp_path / "depth" / "v.npy"
-    assert suite_judge.read_depth(tmp_path, view) is None
+    assert run_figures.read_depth(tmp_path, view) is None
     for bad in (b"", b"\x93NUMPY", b"text"):
         file.write_bytes(bad)
-        assert suite_judge.read_depth(tmp_path, view) is None
+        assert run_figures.read_depth(tmp_path, view) is None
     np.save(file, np.array([{}]))  # needs pickle, which is never read
-    assert suite_judge.read_depth(tmp_path, view) is None
+    assert run_figures.read_depth(tmp_path, view) is None
     np.save(file, np.ones((3, 2)))
-    assert suite_judge.read_depth(tmp_path, view) is None
+    assert run_figures.read_depth(tmp_path, view) is None
     np.save(file, np.full((2, 3), 1.5))
-    found = suite_judge.read_depth(tmp_path, view)
+    found = run_figures.read_depth(tmp_path, view)
     assert found is not None
     assert found.tolist() == [[1.5] * 3] * 2
 
 
 def test_the_view_of_the_grid_is_the_one_farthest_from_all_inputs() -> None:
-    scene = load_scene(str(suite.PACKAGE / "demo"))
-    far, near = suite_judge.remote_view(scene)
+    scene = load_scene(str(definition.PACKAGE / "demo"))
+    far, near = run_figures.remote_view(scene)
 
     def distance(view: Any) -> float:
         return min(float((view.camera.centers - one.camera.centers).norm()) for one in scene.train)
@@ -240,7 +241,7 @@ def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_smoke_trains_judges_and_draws(smoke: Path) -> None:
-    found = suite_file.read(smoke)
+    found = result_file.read(smoke)
     assert [run["arm"] for run in found["runs"]] == ["3dgs", "ours-0"]
     assert {skip["arm"] for skip in found["skipped"]} == {"ours", "ours-template"}
     assert all("no prior at hand" in skip["reason"] for skip in found["skipped"])
@@ -252,19 +253,19 @@ def test_smoke_trains_judges_and_draws(smoke: Path) -> None:
         assert times == sorted(times)
         assert 0.3 < run["mean"]["mask_iou"] < 1
     assert "data:image/webp" in smoke.with_suffix(".html").read_text()
-    assert list(suite_bench.work_folder(smoke).glob("run-*")) == []
+    assert list(runner.work_folder(smoke).glob("run-*")) == []
 
 
 def test_the_same_run_gives_the_same_figures(smoke: Path, tmp_path: Path) -> None:
     file = tmp_path / "again.json"
     assert cli.main(["bench", "--suite", "smoke", "--seeds", "1", "--arms", "ours-0", "-o", str(file)]) == 0
-    first = next(run for run in suite_file.read(smoke)["runs"] if run["arm"] == "ours-0")
-    (second,) = suite_file.read(file)["runs"]
+    first = next(run for run in result_file.read(smoke)["runs"] if run["arm"] == "ours-0")
+    (second,) = result_file.read(file)["runs"]
     assert [{k: v for k, v in run.items() if k not in DIFFERENT} for run in (first, second)] == [
         {k: v for k, v in first.items() if k not in DIFFERENT}
     ] * 2
     assert [look["psnr"] for look in first["curve"]] == [look["psnr"] for look in second["curve"]]
-    pictures = [suite_file.read_pictures(path) for path in (smoke, file)]
+    pictures = [result_file.read_pictures(path) for path in (smoke, file)]
     assert all(pictures[0][name] == value for name, value in pictures[1].items())
 
 
@@ -294,15 +295,15 @@ def published(folder: Path, count: int) -> Path:
 
 def test_the_published_layout_is_trained_and_judged_by_every_eighth_image(tmp_path: Path) -> None:
     published(tmp_path / "root" / "tandt" / "train", 10)
-    case = next(suite.cases(suite.load("paper"), 1))
+    case = next(definition.cases(definition.load("paper"), 1))
     assert case.scene == "tandt/train"
     case = replace(case, iterations=10, flags=(*case.flags, "--iterations", "10"))
     bench = Bench(tmp_path / "root", tmp_path / "work", 1)
     bench.work.mkdir()
-    made, protocol, _ = suite_run.measure(case, bench)
+    made, protocol, _ = single_run.measure(case, bench)
     assert made["views_in"] == 8
     assert made["views_out"] == ["images/00000.jpg", "images/00008.jpg"]
     assert made["per_view"]["mask_iou"] == [None, None]
     assert made["n_gaussians"] == 12 * 40
     assert "split: learned from 8 views, held out 2" in protocol
-    assert "not guided" in (suite_run.reason_to_skip(replace(case, arm="ours"), bench) or "")
+    assert "not guided" in (single_run.reason_to_skip(replace(case, arm="ours"), bench) or "")

@@ -1,6 +1,6 @@
 """Seconds of CPU and megabytes that importing takes, added to a list in a file. For people, not for the test suite.
 
-python tests/blender/measure_import.py benchmarks/results/blender.json 10000 100000 1000000      (needs bpy)
+python tests/blender/measure_import.py experiments/results/blender.json 10000 100000 1000000      (needs bpy)
 """
 
 from __future__ import annotations

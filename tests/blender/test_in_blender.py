@@ -167,6 +167,7 @@ def test_an_edited_export_has_the_picture_of_what_was_kept(panel: Any, tmp_path:
     from mathutils import Matrix
 
     import gsopt
+    from gsopt.geometry.cameras import look_at
 
     thing = bring_in(tmp_path / "a.ply")
     thing.matrix_world = Matrix.Rotation(0.7, 4, "X") @ Matrix.Scale(3.0, 4)
@@ -178,7 +179,7 @@ def test_an_edited_export_has_the_picture_of_what_was_kept(panel: Any, tmp_path:
     kept = before.opacities >= 0.4
     eyes = torch.tensor([[0.0, 1.0, -6.0]])
     lens = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]])
-    cameras = gsopt.Cameras(gsopt.cameras.look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), lens, 48, 48)
+    cameras = gsopt.Cameras(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), lens, 48, 48)
     pictures = [gsopt.rasterize(splats, cameras).colors for splats in (before.select(kept), after)]
     assert pictures[0].max() > 0.2
     assert torch.allclose(*pictures, atol=1e-5)

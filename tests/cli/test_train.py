@@ -15,7 +15,7 @@ from finished_runs import ring, splats, write_split
 from gsopt import cli
 from gsopt.cli.console import clock, progress_line
 from gsopt.cli.train import Density, Flags, make_config, read_flags, summary
-from gsopt.config import DensityConfig, TrainConfig
+from gsopt.config.train import DensityConfig, TrainConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.events import read_events
 
@@ -232,7 +232,7 @@ def test_a_failing_evaluation_is_the_last_event(data: Path, tmp_path: Path, monk
     def fail(*args: object, **kwargs: object) -> None:
         raise InputError("the test image vanished. Restore it.")
 
-    monkeypatch.setattr("gsopt.evaluation.evaluate", fail)
+    monkeypatch.setattr("gsopt.results.evaluation.evaluate", fail)
     assert cli.main(["train", *small(data, tmp_path / "run")]) == 3
     assert "vanished" in capsys.readouterr().err
     assert kinds(tmp_path / "run")[-1] == "error"

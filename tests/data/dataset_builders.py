@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsopt.cameras import look_at, opengl_from_viewmats
+from gsopt.geometry.cameras import look_at, opengl_from_viewmats
 
 SIZE = 16
 

@@ -11,7 +11,7 @@ import torch
 from dataset_builders import POINTS, SIZE, colmap, ring, save_image
 from PIL import Image
 
-from gsopt.config import DataConfig
+from gsopt.config.train import DataConfig
 from gsopt.data.colmap_files import MODELS
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError

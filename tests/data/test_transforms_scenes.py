@@ -12,10 +12,10 @@ from dataset_builders import SIZE, frames_of, nerf_synthetic, nerfstudio, read_d
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from gsopt.config import DataConfig
+from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.data.undistort import choose_pinhole
-from gsopt.init.rig import sees
+from gsopt.geometry.projection import sees
 
 
 def test_nerf_synthetic_poses_pixels_and_splits(tmp_path: Path) -> None:

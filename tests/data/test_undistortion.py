@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from gsopt.cameras import Cameras
 from gsopt.data.colmap import _camera_model
 from gsopt.data.colmap_files import CameraRecord
 from gsopt.data.lens import Lens
 from gsopt.data.resample import premultiply, unpremultiply
 from gsopt.data.undistort import ZOOM_MIN, choose_pinhole, undistort
 from gsopt.errors import InputError
-from gsopt.init.rig import project
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import project
 
 WIDTH, HEIGHT = 320, 240
 FOX = (0.0578421, -0.0805099, -0.000980296, 0.00015575)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from dataset_builders import nerf_synthetic, nerfstudio
 
-from gsopt.config import DataConfig
+from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.data.split import farthest_points
 from gsopt.errors import InputError, UsageError

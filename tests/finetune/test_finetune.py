@@ -13,20 +13,20 @@ import pytest
 import torch
 
 from gsopt.cli import main
-from gsopt.config import InitConfig
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.train import InitConfig
 from gsopt.errors import InputError, UsageError
-from gsopt.finetune import fits, measure
-from gsopt.finetune.course import Course
-from gsopt.finetune.fits import Pairs, look, make_pairs, whole_scene
-from gsopt.finetune.learn import STATE, Training, loss
-from gsopt.finetune.lessons import draw
+from gsopt.finetune import evaluation, reconstruction_pairs
+from gsopt.finetune.batches import draw
+from gsopt.finetune.reconstruction_pairs import Pairs, look, make_pairs, whole_scene
 from gsopt.finetune.run import Lessons
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.finetune.trainer import STATE, Training, loss
+from gsopt.finetune.training_config import Course
 from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
-from gsopt.sds.opening import open_prior
-from gsopt.sds.prior import Condition
-from gsopt.sds.view_prior import CHANNELS, ViewPrior, make_unet, predict
+from gsopt.sds.load_prior import open_prior
+from gsopt.sds.priors.protocol import Condition
+from gsopt.sds.priors.view_conditioned import CHANNELS, ViewPrior, make_unet, predict
 
 pytest.importorskip("diffusers")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
@@ -38,7 +38,7 @@ SIZE = 64
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> None:
     """Fits of a handful of steps, few renders to measure on: how much is learned is not what is tested."""
-    fits.LENGTHS, measure.MOST = (12,), 2
+    reconstruction_pairs.LENGTHS, evaluation.MOST = (12,), 2
 
 
 @pytest.fixture(scope="module")

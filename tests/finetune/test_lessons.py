@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsopt.finetune import library
-from gsopt.finetune.fits import Pairs
-from gsopt.finetune.lessons import REPAIR_SHARE, SIDE, USUAL_ERROR, Batch, draw, on_background
+from gsopt.finetune import pair_cache
+from gsopt.finetune.batches import REPAIR_SHARE, SIDE, USUAL_ERROR, Batch, draw, on_background
+from gsopt.finetune.reconstruction_pairs import Pairs
 from gsopt.raster.backend import Backend
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.sds.view_prior import CHANNELS, WARPED, cosine_schedule
+from gsopt.sds.priors.view_conditioned import CHANNELS, WARPED, cosine_schedule
 
 NOISE = cosine_schedule()
 
@@ -116,8 +116,8 @@ def test_pairs_serve_again_only_for_the_same_scene_size_and_seed(
         made.append((scene, size, seed))
         return perfect_pairs(1)
 
-    monkeypatch.setattr(library, "make_pairs", make)
+    monkeypatch.setattr(pair_cache, "make_pairs", make)
     calls = [("a", 80, 0), ("a", 80, 0), ("a", 64, 0), ("a", 80, 1), ("b", 80, 0)]
     for root, size, seed in calls:
-        library.collect([tmp_path / root / "cup"], 1, size, seed, tmp_path / "pairs", ReferenceBackend(), print)
+        pair_cache.collect([tmp_path / root / "cup"], 1, size, seed, tmp_path / "pairs", ReferenceBackend(), print)
     assert made == [(tmp_path / root / "cup", size, seed) for root, size, seed in calls[1:]]

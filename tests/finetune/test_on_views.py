@@ -18,19 +18,19 @@ import tiny_sd21
 from tiny_scenes import write_dataset
 
 from gsopt.cli import main
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.finetune.on_views import run as stage
-from gsopt.finetune.on_views import sheet
-from gsopt.finetune.on_views import training as training_module
-from gsopt.finetune.on_views.lessons import Lesson, Lessons, make_lessons
-from gsopt.finetune.on_views.pictures import Chosen, find_pictures
-from gsopt.finetune.on_views.settings import Preparation, Study
-from gsopt.finetune.on_views.training import STATE, Training, loss
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds.diffusers_prior import DiffusersPrior
-from gsopt.sds.folder import find_folder
+from gsopt.finetune.on_views import sample_sheet
+from gsopt.finetune.on_views import trainer as training_module
+from gsopt.finetune.on_views.batches import Lesson, Lessons, make_lessons
+from gsopt.finetune.on_views.images import Chosen, find_pictures
+from gsopt.finetune.on_views.trainer import STATE, Training, loss
+from gsopt.finetune.on_views.training_config import Preparation, Study
+from gsopt.sds.load_prior import open_prior
 from gsopt.sds.noise import Prediction
-from gsopt.sds.opening import open_prior
-from gsopt.sds.prior import Condition
+from gsopt.sds.priors.folder import find_folder
+from gsopt.sds.priors.protocol import Condition
+from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
 STEPS = 6
 
@@ -38,7 +38,7 @@ STEPS = 6
 @pytest.fixture(scope="module", autouse=True)
 def small_sheets() -> None:
     """What they show is not what is tested."""
-    sheet.STEPS, sheet.SHOWN = 2, 1
+    sample_sheet.STEPS, sample_sheet.SHOWN = 2, 1
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_lessons_are_spread_over_pictures_noise_and_words(lessons: Lessons) -> N
 def test_latents_are_those_of_the_prior(base: Path, scene: Path, lessons: Lessons) -> None:
     """Scaled, of the image on white."""
     from gsopt.data.scene import load_scene
-    from gsopt.sds.views import square_views
+    from gsopt.sds.candidate_views import square_views
 
     prior = opened(base)
     images = square_views(load_scene(scene).train, prior.size, torch.ones(3)).images

@@ -15,9 +15,9 @@ from PIL import Image
 
 from gsopt.cli import main
 from gsopt.errors import InputError, UsageError
-from gsopt.finetune.on_views import training
-from gsopt.finetune.on_views.pictures import Chosen, find_pictures, jittered, prepared, read_upright, stretched
-from gsopt.finetune.on_views.settings import Preparation, Study
+from gsopt.finetune.on_views import trainer
+from gsopt.finetune.on_views.images import Chosen, find_pictures, jittered, prepared, read_upright, stretched
+from gsopt.finetune.on_views.training_config import Preparation, Study
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sds"))
@@ -41,7 +41,7 @@ def silent(line: str) -> None:
 @pytest.fixture(scope="module", autouse=True)
 def short_exams() -> None:
     """How much is learned is not what is tested."""
-    training.EXAM_PICTURES, training.EXAM_TIMES = 1, (0.5,)
+    trainer.EXAM_PICTURES, trainer.EXAM_TIMES = 1, (0.5,)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_a_scene_gives_its_input_views_and_a_folder_its_images(scene: Path, phot
 
 def test_views_are_those_of_gsopt_train(scene: Path) -> None:
     """What is held out there is not learned here."""
-    from gsopt.config import DataConfig
+    from gsopt.config.train import DataConfig
     from gsopt.data.scene import load_scene
 
     views = [f"chair/{v.name}" for v in load_scene(DataConfig(str(scene), views=2)).train]
@@ -271,10 +271,10 @@ def test_flags_that_do_not_fit_the_data_are_refused(scene: Path, photos: Path, c
 
 
 def test_too_many_variants_are_refused_before_anything_is_encoded(base: Path, photos: Path, tmp_path: Path) -> None:
-    from gsopt.finetune.on_views.lessons import make_lessons
-    from gsopt.guidance_config import GuidanceConfig
-    from gsopt.sds.diffusers_prior import DiffusersPrior
-    from gsopt.sds.folder import find_folder
+    from gsopt.config.guidance import GuidanceConfig
+    from gsopt.finetune.on_views.batches import make_lessons
+    from gsopt.sds.priors.folder import find_folder
+    from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
     pictures = find_pictures([photos], Chosen(), "", silent) * 2100
     prior = DiffusersPrior(find_folder(str(base)), GuidanceConfig())
@@ -331,8 +331,8 @@ def learned(base: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.mark.parametrize(("spoil", "said"), [f[1:] for f in FAULTS + LATER], ids=[f[0] for f in FAULTS + LATER])
 def test_a_broken_lora_is_named(learned: Path, tmp_path: Path, spoil: Callable[[Path], object], said: str) -> None:
-    from gsopt.guidance_config import GuidanceConfig
-    from gsopt.sds.opening import open_prior
+    from gsopt.config.guidance import GuidanceConfig
+    from gsopt.sds.load_prior import open_prior
 
     own = Path(shutil.copytree(learned, tmp_path / "own"))
     spoil(own / "lora")

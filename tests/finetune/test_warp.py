@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from gsopt.cameras import Cameras, intrinsics, look_at
-from gsopt.init.rig import project
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
+from gsopt.geometry.projection import project
 from gsopt.sds.warp import lift, warp
 
 SIZE = 48

@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from gsopt.cli import main
-from gsopt.finetune import captions, fits, measure, run
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.finetune import captions, evaluation, reconstruction_pairs, run
+from gsopt.finetune.caption_tokens import tell
 from gsopt.finetune.clip import make_tokenizer
-from gsopt.finetune.told import tell
-from gsopt.finetune.words import find_encoder, said_of_all, words_known
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds.opening import open_prior
-from gsopt.sds.prior import Condition
-from gsopt.sds.view_prior import TOKEN_WIDTH, Said, make_deaf, make_unet, predict
+from gsopt.finetune.text_encoder import find_encoder, said_of_all, words_known
+from gsopt.sds.load_prior import open_prior
+from gsopt.sds.priors.protocol import Condition
+from gsopt.sds.priors.view_conditioned import TOKEN_WIDTH, Said, make_deaf, make_unet, predict
 
 pytest.importorskip("diffusers")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
@@ -31,7 +31,7 @@ CAPTIONS = {"one": "a red cup", "two": "a blue table", "three": "a red table"}
 
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> None:
-    fits.LENGTHS, measure.MOST = (12,), 2
+    reconstruction_pairs.LENGTHS, evaluation.MOST = (12,), 2
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsopt.gaussians import Gaussians
-from gsopt.quats import normalize
+from gsopt.geometry.quats import normalize
 
 
 def make_splats(count: int = 300, degree: int = 3, seed: int = 0) -> Gaussians:

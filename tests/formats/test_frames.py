@@ -6,10 +6,10 @@ import pytest
 import torch
 from splat_samples import make_splats, same_bits
 
-from gsopt import sh
-from gsopt.formats.frames import LEFT_UP_FORWARD, RIGHT_UP_BACK, Signs, turned
+from gsopt.formats.axes import LEFT_UP_FORWARD, RIGHT_UP_BACK, Signs, turned
 from gsopt.gaussians import Gaussians
-from gsopt.quats import rotation_matrices
+from gsopt.geometry import sh
+from gsopt.geometry.quats import rotation_matrices
 
 FRAMES = [RIGHT_UP_BACK, LEFT_UP_FORWARD]
 

@@ -13,8 +13,8 @@ from splat_samples import errors, make_splats, same_bits
 from gsopt.errors import InputError
 from gsopt.formats import load_splats, save_splats
 from gsopt.formats.compressed_ply import CHUNK
-from gsopt.formats.morton import morton_order
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.morton import morton_order
 
 BYTE = 0.5 / 255 + 1e-6
 C0 = 0.28209479177387814

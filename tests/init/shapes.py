@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsopt.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 
 FIELD_OF_VIEW = 0.7
 RED, BLUE = (230, 30, 20), (20, 40, 220)

@@ -10,15 +10,15 @@ import pytest
 import torch
 from shapes import ellipsoid_scene, spread_cameras
 
-from gsopt.cameras import Cameras, look_at
-from gsopt.config import DataConfig, InitConfig
+from gsopt.config.train import DataConfig, InitConfig
 from gsopt.data.scene import Points, Scene, load_scene
 from gsopt.errors import UsageError
+from gsopt.geometry.cameras import Cameras, look_at
+from gsopt.geometry.projection import find_focus, sees
+from gsopt.geometry.sh import rgb_from_sh0
 from gsopt.init import first_gaussians
 from gsopt.init.frustum import random_points
 from gsopt.init.neighbors import mean_neighbor_distance
-from gsopt.init.rig import find_focus, sees
-from gsopt.sh import rgb_from_sh0
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,14 @@ import pytest
 import torch
 from shapes import BLUE, RED, ellipsoid_scene, spread_cameras
 
-from gsopt.cameras import Cameras
-from gsopt.config import InitConfig
+from gsopt.config.train import InitConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import UsageError
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import find_focus, sees
 from gsopt.init import first_gaussians
 from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
-from gsopt.init.photos import Photo, small_photos
-from gsopt.init.rig import find_focus, sees
+from gsopt.init.thumbnails import Photo, small_photos
 
 CENTER, RADII = (0.3, -0.2, 0.1), (0.9, 0.6, 0.4)
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from shapes import ellipsoid_scene, spread_cameras
 
-from gsopt.cameras import Cameras
 from gsopt.data.scene import load_scene
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import find_focus
+from gsopt.geometry.voxels import Grid
 from gsopt.init.hull import carve
-from gsopt.init.photos import Photo, small_photos
-from gsopt.init.rig import find_focus
-from gsopt.init.rounded import FAR, RATIO, rounded, squared_distance, thickest, thickness
-from gsopt.init.voxels import Grid
+from gsopt.init.rounded_hull import FAR, RATIO, rounded, squared_distance, thickest, thickness
+from gsopt.init.thumbnails import Photo, small_photos
 
 CENTER = (0.3, -0.2, 0.1)
 

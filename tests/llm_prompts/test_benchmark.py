@@ -1,4 +1,4 @@
-"""benchmarks/prompts.py in small: every arm once, nothing twice, a table of what was measured."""
+"""experiments/prompts.py in small: every arm once, nothing twice, a table of what was measured."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import tyro
 
 from gsopt import cli
 from gsopt.cli.train import Flags, read_flags
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.llm_prompts.schema import read_prompts
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "prompts.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "experiments" / "prompts.py"
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_every_arm_is_run_once_with_its_own_prompts_and_the_table_pairs_them(
 
 
 def test_every_validation_object_has_notes_that_make_prompts(benchmark, tmp_path: Path, shared_data: Path) -> None:
-    from gsopt.llm_prompts.make import Job, make_prompts
+    from gsopt.llm_prompts.generate import Job, make_prompts
 
     notes = json.loads((SCRIPT.parent / "prompts_notes.json").read_text())
     objects = [name.split("/")[-1] for name in json.loads((shared_data / "splits.json").read_text())["val"]]

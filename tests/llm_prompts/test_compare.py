@@ -12,7 +12,7 @@ from tiny_scenes import write_dataset
 
 from gsopt import cli
 from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, write_prompts, write_set
-from gsopt.sds import opening
+from gsopt.sds import load_prior
 
 
 @pytest.fixture(scope="module")
@@ -48,16 +48,16 @@ def test_a_prior_that_takes_no_words_is_said_to_make_no_difference(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     toy = PixelPrior(gaussian_posterior(0.2, 0.5), size=16)
-    monkeypatch.setattr(opening, "open_prior", lambda name, config: toy)
+    monkeypatch.setattr(load_prior, "open_prior", lambda name, config: toy)
     write_prompts(tmp_path / "p.json", [Prompt("a chair")])
     assert compare(dataset, tmp_path, "toy/prior", tmp_path / "p.json") == 2
     assert "takes no words" in capsys.readouterr().err
 
 
 def test_a_view_left_out_is_not_learned_from(dataset: Path) -> None:
-    from gsopt.config import DataConfig
+    from gsopt.config.train import DataConfig
     from gsopt.data.scene import load_scene
-    from gsopt.training.leave_one_out import spread_views, without
+    from gsopt.training.guided.guard import spread_views, without
 
     scene = load_scene(DataConfig(path=str(dataset)))
     chosen = spread_views(scene, 3)

@@ -181,7 +181,7 @@ def test_a_clip_that_cannot_be_opened_stops_before_the_model_is_asked(tmp_path: 
 
 
 def test_a_dataset_gives_its_input_views(tmp_path: Path) -> None:
-    from gsopt.llm_prompts.views import MOST_SENT, SIDE, read_views, to_jpegs, to_squares
+    from gsopt.llm_prompts.expert_images import MOST_SENT, SIDE, read_views, to_jpegs, to_squares
 
     scene = write_dataset(tmp_path / "cloud", train=20)
     views = read_views([scene])

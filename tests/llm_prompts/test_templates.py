@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError, UsageError
-from gsopt.llm_prompts.distinct import is_like
+from gsopt.llm_prompts.deduplicate import is_like
 from gsopt.llm_prompts.expand import FEWEST_WITH_SIDES, SIDES, Wish, expand, filled_up, own_words, slot_of
 from gsopt.llm_prompts.schema import Prompt
 from gsopt.llm_prompts.subject import content, find_object, names, with_article

@@ -12,9 +12,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError
-from gsopt.llm_prompts.clean import LONGEST_WORDS, Unusable, cleaned, cleaned_rationale, printable
 from gsopt.llm_prompts.expand import Wish
 from gsopt.llm_prompts.reply import read_reply, reply_schema
+from gsopt.llm_prompts.sanitize import LONGEST_WORDS, Unusable, cleaned, cleaned_rationale, printable
 from gsopt.llm_prompts.schema import Prompt
 from gsopt.llm_prompts.tokens import ESTIMATE, LONGEST, counter_for
 

@@ -9,9 +9,9 @@ from hypothesis import strategies
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsopt import sh
-from gsopt.cameras import Cameras, intrinsics, look_at
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import sh
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.raster.backend import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from gsopt.raster.reference import project, raw_alphas, splat, transmittances
 

@@ -1,6 +1,6 @@
 """The table of the stress suite: what each case strains, what must come out, how close to the float64 reference.
 
-`test_stress.py` holds the laws; `benchmarks/stress.py` measures the same cases and writes docs/performance.md.
+`test_stress.py` holds the laws; `experiments/stress.py` measures the same cases and writes docs/performance.md.
 """
 
 from __future__ import annotations

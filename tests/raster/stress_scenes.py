@@ -16,8 +16,8 @@ from jaxtyping import Float
 from raster_scenes import Case
 from torch import Tensor
 
-from gsopt.cameras import Cameras, intrinsics, look_at
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.raster.backend import RasterSettings
 
 TRAINED = Path(__file__).parent / "data" / "trained_patch.npz"

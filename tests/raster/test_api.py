@@ -12,9 +12,9 @@ from raster_scenes import Case, make_case, weights_like
 from tolerances import EXACT
 from torch import Tensor
 
-from gsopt.cameras import Cameras
 from gsopt.errors import InputError, MissingDependency, UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import Rendering, expected_depth, make_backend, rasterize
 from gsopt.raster.reference import ReferenceBackend
 

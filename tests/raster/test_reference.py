@@ -12,10 +12,10 @@ from raster_scenes import Case, cases, make_case, with_parameter
 from tolerances import EXACT
 from torch import Tensor
 
-from gsopt import quats, sh
-from gsopt.cameras import Cameras, intrinsics
 from gsopt.errors import UsageError
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import quats, sh
+from gsopt.geometry.cameras import Cameras, intrinsics
 from gsopt.raster import reference
 from gsopt.raster.backend import ALPHA_MIN, Frame, RasterSettings
 

@@ -9,8 +9,8 @@ import torch
 from raster_scenes import Case, make_case, weights_like
 from torch import Tensor
 
-from gsopt import quats as quaternions
-from gsopt import sh
+from gsopt.geometry import quats as quaternions
+from gsopt.geometry import sh
 from gsopt.raster.backend import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, RasterSettings
 from gsopt.raster.reference import ReferenceBackend, Splats, jacobians, project, raw_alphas, splat
 from gsopt.raster.ssim import C1, C2, blur, ssim_map

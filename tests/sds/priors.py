@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsopt.sds.noise import NoiseSchedule, Prediction, eps_from, output_for, x0_from
-from gsopt.sds.prior import Condition, Encoder, Pair, Scale
+from gsopt.sds.priors.protocol import Condition, Encoder, Pair, Scale
 
 STEPS = 1000
 NOBODY = Pair(Condition(), Condition())

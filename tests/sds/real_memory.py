@@ -14,12 +14,13 @@ from real_step import size
 from tensor_meter import Meter, Phase
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-import gsopt.sds.prior
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds import diffusers_prior, policies
-from gsopt.sds.diffusers_prior import DiffusersPrior
-from gsopt.sds.folder import DiffusersFolder
-from gsopt.sds.prior import Condition, Pair, Scale
+import gsopt.sds.priors.protocol
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.sds import policies
+from gsopt.sds.priors import stable_diffusion
+from gsopt.sds.priors.folder import DiffusersFolder
+from gsopt.sds.priors.protocol import Condition, Pair, Scale
+from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,13 @@ def account(
     unet: dict[str, Any] = real_sd21.UNET,
     vae: dict[str, Any] = real_sd21.VAE,
 ) -> Account:
-    """A step as `gsopt.sds.guidance` makes it: encode, two halves of classifier-free guidance, the encoder backwards;
+    """A step as `gsopt.sds.guidance_step` does: encode, two halves of classifier-free guidance, the encoder backwards;
     then the picture for the report."""
     prior = _prior(side, dtype, unet, vae)
     with FakeTensorMode(allow_non_fake_inputs=True), Meter() as meter:
         _give_networks(prior, tiny)
         if checkpointed and not tiny:
-            diffusers_prior.recompute(prior.vae)
+            stable_diffusion.recompute(prior.vae)
         images = torch.rand(1, 3, side, side).requires_grad_()
         with meter.phase("step"):
             step(prior, images, meter, sequential)
@@ -79,8 +80,8 @@ def step(prior: DiffusersPrior, images: torch.Tensor, meter: Meter, sequential: 
 
     prior.denoise = denoise  # type: ignore[method-assign]
     with pytest.MonkeyPatch.context() as patch:  # what looks at numbers, which fake tensors have not
-        patch.setattr(gsopt.sds.prior, "_finite", lambda prior, x0, t: x0)
-        patch.setattr(diffusers_prior, "padded_tokens", lambda rows: (torch.stack(rows), None))
+        patch.setattr(gsopt.sds.priors.protocol, "_finite", lambda prior, x0, t: x0)
+        patch.setattr(stable_diffusion, "padded_tokens", lambda rows: (torch.stack(rows), None))
         g = policies.sds(prior, z, look).g
     with meter.phase("backward"):
         torch.autograd.grad(z, images, g)

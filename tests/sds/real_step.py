@@ -17,8 +17,8 @@ from tensor_meter import Meter, Phase
 
 from gsopt.cli import main
 from gsopt.raster.backend import Gradients
-from gsopt.sds.diffusers_prior import DiffusersPrior
-from gsopt.sds.guidance import Guide
+from gsopt.sds.guidance_step import Guide
+from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
 FLAGS = [
     *["--iterations", "2", "--guidance.start", "0", "--guidance.stop", "1", "--guidance.every", "10"],

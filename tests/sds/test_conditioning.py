@@ -10,13 +10,13 @@ import pytest
 import tiny_sd21
 import torch
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError
-from gsopt.guidance_config import GuidanceConfig
 from gsopt.llm_prompts.schema import Prompt
 from gsopt.sds.conditioning import WORDS, Conditioning, encode, worded
+from gsopt.sds.load_prior import open_prior
 from gsopt.sds.noise import generator
-from gsopt.sds.opening import open_prior
-from gsopt.sds.prior import Encoder
+from gsopt.sds.priors.protocol import Encoder
 
 NOTHING = torch.empty(0, 3, 8, 8)
 

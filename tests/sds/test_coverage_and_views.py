@@ -10,14 +10,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsopt.cameras import Cameras, intrinsics, look_at
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.gaussians import Gaussians
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.raster.api import make_backend
 from gsopt.sds import coverage, schedule
+from gsopt.sds.candidate_views import AZIMUTHS, HIGHEST, LOWEST, draw_candidate, make_rig, nearest, square
 from gsopt.sds.noise import generator
-from gsopt.sds.prior import References
-from gsopt.sds.views import AZIMUTHS, HIGHEST, LOWEST, draw_candidate, make_rig, nearest, square
+from gsopt.sds.priors.protocol import References
 
 BACKEND = make_backend("cpu", 1)
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -92,7 +92,7 @@ def test_an_empty_view_is_not_uncertain() -> None:
 
 def test_coverage_does_not_depend_on_the_world_frame() -> None:
     """Rotating and shifting Gaussians and cameras together changes nothing."""
-    from gsopt.quats import multiply
+    from gsopt.geometry.quats import multiply
 
     half = math.sqrt(0.5)
     turn = torch.tensor([half, 0.0, 0.0, half])  # 90 degrees about z

@@ -10,14 +10,15 @@ import tiny_sd21
 import torch
 from priors import scale
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError, NumericalError, UsageError
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds import diffusers_prior, policies
-from gsopt.sds.diffusers_prior import DiffusersPrior, choose_dtype, padded_tokens
-from gsopt.sds.folder import find_folder
+from gsopt.sds import policies
+from gsopt.sds.load_prior import open_prior
 from gsopt.sds.noise import eps_from
-from gsopt.sds.opening import open_prior
-from gsopt.sds.prior import Condition, Pair, guided_x0
+from gsopt.sds.priors import stable_diffusion
+from gsopt.sds.priors.folder import find_folder
+from gsopt.sds.priors.protocol import Condition, Pair, guided_x0
+from gsopt.sds.priors.stable_diffusion import DiffusersPrior, choose_dtype, padded_tokens
 
 CPU = torch.device("cpu")
 
@@ -119,7 +120,7 @@ def test_recomputed_encoder_blocks_give_the_same_gradient_and_keep_less(sd21: Pa
 
     for plain in (False, True):
         if plain:
-            monkeypatch.setattr(diffusers_prior, "recompute", lambda vae: None)
+            monkeypatch.setattr(stable_diffusion, "recompute", lambda vae: None)
         prior = opened(sd21)
         images = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)).requires_grad_()
         kept.append(0)

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds.choice import Choice, choose, fitting
-from gsopt.sds.opening import open_prior
-from gsopt.sds.prior import Condition
-from gsopt.sds.view_prior import ViewPrior
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.sds.load_prior import open_prior
+from gsopt.sds.priors.protocol import Condition
+from gsopt.sds.priors.view_conditioned import ViewPrior
+from gsopt.sds.select_prior import Choice, choose, fitting
 
 pytest.importorskip("diffusers")
 DEFAULT = Choice("embedded", 0.2, "the embedded prior (default)")

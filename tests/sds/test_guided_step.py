@@ -10,17 +10,17 @@ import pytest
 import torch
 from priors import PixelPrior, gaussian_posterior, knows
 
-from gsopt.cameras import Cameras, intrinsics, look_at
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.llm_prompts.schema import Prompt
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.sds import policies
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.guidance import MOST_FAILURES, Guide, Seen
+from gsopt.sds.guidance_step import MOST_FAILURES, Guide, Seen
 
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)

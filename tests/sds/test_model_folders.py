@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import tiny_sd21
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import GsoptError, InputError, UsageError
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds.choice import choose
-from gsopt.sds.folder import SD21, find_folder
-from gsopt.sds.opening import open_prior
+from gsopt.sds.load_prior import open_prior
+from gsopt.sds.priors.folder import SD21, find_folder
+from gsopt.sds.select_prior import choose
 
 
 def truncate(path: Path) -> None:

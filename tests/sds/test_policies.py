@@ -8,12 +8,12 @@ import pytest
 import torch
 from priors import NOBODY, PixelPrior, cosine_schedule, gaussian_posterior, knows, scale
 
+from gsopt.config.guidance import GuidanceConfig, settled
 from gsopt.errors import InputError, NumericalError
-from gsopt.guidance_config import GuidanceConfig, settled
 from gsopt.sds import policies
 from gsopt.sds.noise import PREDICTIONS, NoiseSchedule, add_noise, eps_from, generator, output_for, weight, x0_from
 from gsopt.sds.policies import Look
-from gsopt.sds.prior import Condition, Pair, guided_x0
+from gsopt.sds.priors.protocol import Condition, Pair, guided_x0
 
 WEIGHTINGS = ("sigma2", "fantasia", "one", "x0")
 

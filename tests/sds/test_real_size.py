@@ -21,7 +21,7 @@ import tiny_sd21
 from real_memory import Account
 from real_step import Step, guided_step
 
-from gsopt.sds.diffusers_prior import LARGE, choose_dtype
+from gsopt.sds.priors.stable_diffusion import LARGE, choose_dtype
 
 opt_in = pytest.mark.skipif(os.environ.get("GSOPT_SD21") != "full", reason="opt-in: make test-sd21")
 GPU = 6e9

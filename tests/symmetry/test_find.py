@@ -12,7 +12,7 @@ from balls import Ball, mirrored, ring, write_balls
 from PIL import Image
 
 from gsopt.data.scene import Scene, load_scene
-from gsopt.init.photos import small_photos
+from gsopt.init.thumbnails import small_photos
 from gsopt.symmetry.find import COLORS, MISSES, Symmetry, find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import REACH, Outline, Silhouettes, outline_pixels, signed_distance

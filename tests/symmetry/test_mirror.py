@@ -7,8 +7,8 @@ from balls import ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.cameras import Cameras
-from gsopt.init.rig import project
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import project
 from gsopt.symmetry.mirror import Mirror
 
 numbers = st.floats(-1, 1, width=32)

@@ -16,7 +16,7 @@ from typing import Any
 import tiny_scenes  # noqa: F401
 import torch
 
-from gsopt.config import TrainConfig
+from gsopt.config.train import TrainConfig
 from gsopt.training import loop, trainer
 
 torch.set_num_threads(1)

@@ -9,7 +9,7 @@ import torch
 from tiny_scenes import cloud
 from torch import Tensor
 
-from gsopt.config import DensityConfig
+from gsopt.config.train import DensityConfig
 from gsopt.gaussians import Gaussians
 from gsopt.raster.backend import Gradients
 from gsopt.training.density import at_least_one

@@ -12,15 +12,15 @@ import pytest
 import torch
 from tiny_scenes import tiny_config
 
-from gsopt.config import DataConfig, OptimizerConfig, TrainConfig
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.train import DataConfig, OptimizerConfig, TrainConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
 from gsopt.events import read_events
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.sds.candidate_views import square_views
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.prior import Condition
-from gsopt.sds.views import square_views
-from gsopt.training import guided_run
+from gsopt.sds.priors.protocol import Condition
+from gsopt.training.guided import start
 from gsopt.training.loop import train
 from gsopt.training.trainer import Trainer
 
@@ -35,7 +35,7 @@ GUIDANCE = GuidanceConfig(
 @pytest.fixture
 def prior(monkeypatch: pytest.MonkeyPatch) -> PixelPrior:
     toy = PixelPrior(gaussian_posterior(0.2, 0.5), size=16)
-    monkeypatch.setattr(guided_run, "open_prior", lambda name, config: toy)
+    monkeypatch.setattr(start, "open_prior", lambda name, config: toy)
     return toy
 
 
@@ -70,7 +70,7 @@ def test_guidance_reaches_the_parameters_and_not_the_statistics(
     dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Density control takes note before guidance is added, and guidance leaves means2d as it is."""
-    from gsopt.training.guidance import RunGuidance
+    from gsopt.training.guided.session import RunGuidance
 
     original, seen = RunGuidance.add, []
 
@@ -202,7 +202,7 @@ def test_words_of_a_run_that_was_broken_off_do_not_guide_the_next_one(
     dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(guided_run, "judge_guidance", lambda *rest: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(start, "judge_guidance", lambda *rest: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             train(config(dataset, prompt=("a cat",)), tmp_path / "run")
     train(config(dataset, prompt=("a dog",)), tmp_path / "run")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tiny_scenes import cloud, tiny_config
 
-from gsopt.config import DataConfig, DensityConfig, LossConfig, OptimizerConfig, SparseConfig, TrainConfig
+from gsopt.config.train import DataConfig, DensityConfig, LossConfig, OptimizerConfig, SparseConfig, TrainConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import GsoptError, InputError, NumericalError, UsageError
 from gsopt.events import EventWriter, read_events

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scenes import cloud
 
-from gsopt.config import DensityConfig
+from gsopt.config.train import DensityConfig
 from gsopt.raster.reference import covariances
 from gsopt.training.density.mcmc import Mcmc, draw, shared, spread
 from gsopt.training.optimizer import Model

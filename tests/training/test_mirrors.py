@@ -11,19 +11,19 @@ import torch
 from balls import Ball, mirrored, ring, write_balls
 from tiny_scenes import tiny_config
 
-from gsopt.cameras import Cameras
 from gsopt.cli.console import RunConsole
-from gsopt.config import InitConfig, PoseConfig, SparseConfig, TrainConfig
+from gsopt.config.train import InitConfig, PoseConfig, SparseConfig, TrainConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
 from gsopt.events import read_events
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras
 from gsopt.metrics import psnr
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.symmetry.find import Symmetry, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
-from gsopt.training.leave_one_out import without
+from gsopt.training.guided.guard import without
 from gsopt.training.loop import train
 from gsopt.training.targets import Targets
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_scenes import cloud, ring
 
-from gsopt.config import OptimizerConfig
+from gsopt.config.train import OptimizerConfig
 from gsopt.gaussians import PARAMETERS
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Gradients, RasterSettings

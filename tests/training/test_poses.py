@@ -13,8 +13,8 @@ import torch
 from tiny_scenes import cloud, ring, tiny_config
 
 from gsopt import cli
-from gsopt.config import PoseConfig, SparseConfig
-from gsopt.data.refined import with_refined_poses
+from gsopt.config.train import PoseConfig, SparseConfig
+from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.raster.backend import RasterSettings

@@ -13,7 +13,7 @@ import pytest
 import torch
 from tiny_scenes import tiny_config
 
-from gsopt.config import (
+from gsopt.config.train import (
     DataConfig,
     DensityConfig,
     OptimizerConfig,

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from tiny_scenes import SIZE, cloud, ring, tiny_config
 from torch import Tensor
 
-from gsopt import sh
-from gsopt.config import DensityConfig, ScheduleConfig, SparseConfig
+from gsopt.config.train import DensityConfig, ScheduleConfig, SparseConfig
 from gsopt.data.scene import load_scene
+from gsopt.geometry import sh
 from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Gradients, RasterSettings

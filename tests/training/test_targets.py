@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsopt.cameras import Cameras
+from gsopt.geometry.cameras import Cameras
 from gsopt.training.targets import Targets
 
 WHITE = torch.ones(3)

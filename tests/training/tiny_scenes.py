@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsopt.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
-from gsopt.config import DataConfig, DensityConfig, InitConfig, TrainConfig
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.train import DataConfig, DensityConfig, InitConfig, TrainConfig
 from gsopt.gaussians import Gaussians
-from gsopt.guidance_config import GuidanceConfig
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 

@@ -21,19 +21,19 @@ from jaxtyping import Float
 
 from gsopt import __version__
 from gsopt._optional import require
+from gsopt.data.posed_images import Frame
 from gsopt.data.scene import read_source
-from gsopt.data.sfm import diagnosis, features, mapping, prior
+from gsopt.data.sfm import diagnosis, features, known_poses, mapping
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import Say, ViewGraph
 from gsopt.data.sfm.masks import Masked, prepare_masks
+from gsopt.data.sfm.overview_image import draw_scene
 from gsopt.data.sfm.photos import Photo, Refused, find_photos, natural, read_photos
-from gsopt.data.sfm.picture import draw_scene
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import extract_frames, is_video
-from gsopt.data.sfm.writing import write_scene
-from gsopt.data.source import Frame
+from gsopt.data.sfm.write_scene import write_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
 
@@ -125,7 +125,7 @@ class _Run:
             )
         for i, photo in enumerate(photos):
             frame = known[photo.source.name]
-            photos[i] = replace(photo, camera=prior.camera_key(frame))
+            photos[i] = replace(photo, camera=known_poses.camera_key(frame))
         return [replace(known[photo.source.name], name=photo.name) for photo in photos]
 
     def _graph(self, photos: list[Photo], masked: Masked, frames: list[Frame] | None) -> tuple[ViewGraph, str]:
@@ -135,7 +135,7 @@ class _Run:
             self.say(f"looking for features in {len(names)} photos (masks: {masked.kind})")
             features.extract(self.pycolmap, self.database, photos, masked, self.config)
             if frames is not None:
-                prior.write_cameras(self.pycolmap, self.database, frames)
+                known_poses.write_cameras(self.pycolmap, self.database, frames)
         with self._timed("matching"):
             graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.say)
         return graph, matching
@@ -145,7 +145,7 @@ class _Run:
             return None
         if frames is None:
             return mapping.find_poses(self.pycolmap, self.database, masked.photos, graph, self.config, self.say)
-        found = prior.triangulate(self.pycolmap, self.database, masked.photos, frames, self.config)
+        found = known_poses.triangulate(self.pycolmap, self.database, masked.photos, frames, self.config)
         return mapping.Mapped(found, "poses as given", [])
 
     def _diagnose(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsopt._optional import require
 from gsopt.events import to_json, write_atomic
-from gsopt.sds.lora import ADAPTER, CONFIG, PREFIX, WEIGHTS
+from gsopt.sds.priors.lora import ADAPTER, CONFIG, PREFIX, WEIGHTS
 
 NAME = "default"
 TARGETS = ["to_q", "to_k", "to_v", "to_out.0"]

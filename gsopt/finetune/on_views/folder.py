@@ -21,11 +21,11 @@ from safetensors import safe_open
 from gsopt.errors import InputError
 from gsopt.events import write_atomic
 from gsopt.finetune.on_views.adapter import PIPELINE, save_adapter
-from gsopt.finetune.on_views.pictures import Picture
-from gsopt.finetune.on_views.settings import Preparation, Study
-from gsopt.finetune.on_views.training import Training
-from gsopt.sds.folder import DiffusersFolder, weight_files
-from gsopt.sds.lora import ADAPTER
+from gsopt.finetune.on_views.images import Picture
+from gsopt.finetune.on_views.trainer import Training
+from gsopt.finetune.on_views.training_config import Preparation, Study
+from gsopt.sds.priors.folder import DiffusersFolder, weight_files
+from gsopt.sds.priors.lora import ADAPTER
 
 PARTS = ("scheduler", "tokenizer", "text_encoder", "vae", "feature_extractor", "image_encoder")
 SMALL = (".json", ".txt")

@@ -11,21 +11,21 @@ from typing import Any
 
 import torch
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
-from gsopt.finetune.library import Say
+from gsopt.finetune.on_views.batches import LATENTS, make_lessons
 from gsopt.finetune.on_views.folder import write_folder
-from gsopt.finetune.on_views.lessons import LATENTS, make_lessons
-from gsopt.finetune.on_views.pictures import Picture
-from gsopt.finetune.on_views.settings import Preparation, Study
-from gsopt.finetune.on_views.sheet import sheet
-from gsopt.finetune.on_views.training import STATE, Training
-from gsopt.guidance_config import GuidanceConfig
-from gsopt.sds.choice import EMBEDDED
-from gsopt.sds.diffusers_prior import LARGE, DiffusersPrior, choose_device, has_bfloat16
-from gsopt.sds.folder import REMEDIES, DiffusersFolder, find_folder
-from gsopt.sds.view_prior import is_view_prior
+from gsopt.finetune.on_views.images import Picture
+from gsopt.finetune.on_views.sample_sheet import sheet
+from gsopt.finetune.on_views.trainer import STATE, Training
+from gsopt.finetune.on_views.training_config import Preparation, Study
+from gsopt.finetune.pair_cache import Say
+from gsopt.sds.priors.folder import REMEDIES, DiffusersFolder, find_folder
+from gsopt.sds.priors.stable_diffusion import LARGE, DiffusersPrior, choose_device, has_bfloat16
+from gsopt.sds.priors.view_conditioned import is_view_prior
+from gsopt.sds.select_prior import EMBEDDED
 
 PLAN = "finetune.json"
 CARD = "README.md"

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.init.stereo.picture import Picture
+from gsopt.init.stereo.image import Picture
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 
 RADIUS, STRIDE = 2, 2

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt.data.scene import Scene
-from gsopt.init.photos import Photo, small_photos
-from gsopt.init.rig import Focus, find_focus, inside, project
+from gsopt.geometry.projection import Focus, find_focus, inside, project
+from gsopt.init.stereo.image import Picture
 from gsopt.init.stereo.matching import Matcher
-from gsopt.init.stereo.picture import Picture
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
+from gsopt.init.thumbnails import Photo, small_photos
 from gsopt.raster.cpu_backend import workspace
 
 PHOTOS = 16

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsopt.init.stereo.image import Picture
 from gsopt.init.stereo.matching import Matcher
-from gsopt.init.stereo.picture import Picture
 
 BEST = 1
 """So many sources count, those that match best: with few photos most do not show a place."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gsopt.config import TrainConfig
+from gsopt.config.train import TrainConfig
 from gsopt.raster.backend import Gradients
 from gsopt.training.optimizer import Model
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gsopt import quats as quaternions
-from gsopt.config import DensityConfig
+from gsopt.config.train import DensityConfig
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import quats as quaternions
 from gsopt.raster.backend import Gradients
 from gsopt.training import schedule
 from gsopt.training.density import at_least_one

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gsopt.config import DensityConfig
+from gsopt.config.train import DensityConfig
 from gsopt.raster.backend import Gradients
 from gsopt.training import schedule
 from gsopt.training.optimizer import Model

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsopt.cameras import Cameras
+from gsopt.geometry.cameras import Cameras
+from gsopt.init.stereo.image import Picture
 from gsopt.init.stereo.matching import LEAST_VARIANCE, TAPS, UNSEEN, Matcher, windows
-from gsopt.init.stereo.picture import Picture
 from gsopt.raster import _cpu
 from gsopt.raster.cpu_backend import ISA_VARIABLE, workspace
 
@@ -126,7 +126,7 @@ def test_planes_that_are_not_numbers_or_lie_behind_are_unseen() -> None:
 def test_the_rooms_own_floor_matches_better_than_another(tmp_path) -> None:
     from rooms import room_scene
 
-    from gsopt.init.photos import small_photos
+    from gsopt.init.thumbnails import small_photos
 
     scene = room_scene(tmp_path / "room", room.arc(4))
     first, second = (Picture.of(photo, 8000) for photo in small_photos(scene.train, 4)[:2])

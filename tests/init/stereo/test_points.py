@@ -10,7 +10,7 @@ import textured_room as room
 import torch
 from rooms import distance_to_the_room, room_scene
 
-from gsopt.config import InitConfig
+from gsopt.config.train import InitConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
 from gsopt.init import first_gaussians
@@ -40,7 +40,7 @@ def test_points_lie_on_the_surfaces(scene: Scene) -> None:
 
 
 def test_points_have_the_colors_of_the_photos(scene: Scene) -> None:
-    from gsopt.init.photos import mean_colors, small_photos
+    from gsopt.init.thumbnails import mean_colors, small_photos
 
     found = points_of(scene)
     shown = mean_colors(small_photos(scene.train, 4), found.xyz)

@@ -1,0 +1,1 @@
+"""`gsopt bench --suite`: many runs, their records and their tables."""

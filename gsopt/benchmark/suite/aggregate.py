@@ -1,0 +1,137 @@
+"""What the runs of a suite say together: means over scenes, paired differences with intervals, seconds to a quality."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gsopt.benchmark.suite import arm_flags
+
+CONFIDENCE = 0.95
+
+Run = Mapping[str, Any]
+Way = tuple[str, int]
+"""Arm and number of steps."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Of one metric, one arm less another, over the same scenes."""
+
+    mean: float
+    half: float | None
+    """Half the width of the confidence interval; None for a single value."""
+    lowest: float
+    highest: float
+    positive: int
+    """Scenes (or seeds of a single scene) where it is above 0."""
+    count: int
+
+
+def way(run: Run) -> Way:
+    return run["arm"], run["iterations"]
+
+
+def by_scene(runs: Sequence[Run], metric: str) -> dict[str, float]:
+    """Mean over seeds; scenes where some run lacks the metric are left out."""
+    found: dict[str, list[float | None]] = {}
+    for run in runs:
+        found.setdefault(run["scene"], []).append(run["mean"][metric])
+    known = {scene: [v for v in values if v is not None] for scene, values in found.items()}
+    return {scene: statistics.fmean(values) for scene, values in known.items() if len(values) == len(found[scene])}
+
+
+def differences(runs: Sequence[Run], a: Way, b: Way, metric: str) -> list[float]:
+    """Of a less b, paired by scene and seed. Seeds of one scene are no independent looks at the world: they are
+    averaged first, and the values are those of scenes. With a single scene they are those of its seeds."""
+    others = {(run["scene"], run["seed"]): run["mean"][metric] for run in runs if way(run) == b}
+    pairs: dict[str, list[float]] = {}
+    for run in runs:
+        other = others.get((run["scene"], run["seed"]))
+        if way(run) == a and other is not None and run["mean"][metric] is not None:
+            pairs.setdefault(run["scene"], []).append(run["mean"][metric] - other)
+    if len(pairs) == 1:
+        return next(iter(pairs.values()))
+    return [statistics.fmean(values) for values in pairs.values()]
+
+
+def summarized(values: Sequence[float]) -> Difference | None:
+    """Mean and Student's confidence interval; None without values."""
+    if not values:
+        return None
+    mean, half = statistics.fmean(values), None
+    if len(values) > 1:
+        error = statistics.stdev(values) / math.sqrt(len(values))
+        half = t_quantile(0.5 + CONFIDENCE / 2, len(values) - 1) * error
+    return Difference(mean, half, min(values), max(values), sum(value > 0 for value in values), len(values))
+
+
+def t_share(t: float, degrees: int) -> float:
+    """P(|T| < t) of Student's t with whole degrees of freedom (Abramowitz & Stegun 26.7.3 and 26.7.4)."""
+    theta = math.atan(t / math.sqrt(degrees))
+    cos, sin = math.cos(theta), math.sin(theta)
+    odd = degrees % 2
+    term, total = (cos if odd else 1.0), 0.0
+    for k in range(1 + odd, degrees, 2):
+        total += term
+        term *= cos * cos * k / (k + 1)
+    return 2 / math.pi * (theta + sin * total) if odd else sin * total
+
+
+def t_quantile(p: float, degrees: int) -> float:
+    """t with P(T < t) = p, p from 1/2 up, by bisection."""
+    low, high = 0.0, 1e6
+    for _ in range(200):
+        middle = (low + high) / 2
+        low, high = (middle, high) if 0.5 + t_share(middle, degrees) / 2 < p else (low, middle)
+    return high
+
+
+def seconds_to(curve: Sequence[Mapping[str, Any]], psnr: float) -> float | None:
+    """CPU seconds until a run's course reaches that quality, linear between two looks; None when it never does."""
+    before: Mapping[str, Any] | None = None
+    for look in curve:
+        if look["psnr"] >= psnr:
+            if before is None:
+                return float(look["cpu_seconds"])
+            share = (psnr - before["psnr"]) / (look["psnr"] - before["psnr"])
+            return float(before["cpu_seconds"] + share * (look["cpu_seconds"] - before["cpu_seconds"]))
+        before = look
+    return None
+
+
+def reached(runs: Sequence[Run], a: Way, base: Way) -> tuple[list[float], int]:
+    """CPU seconds of each run of `a` until it is as good as the paired run of `base` ends (both by the views of the
+    curve), and how many pairs there are; runs that never get there have no seconds."""
+    goals = {(run["scene"], run["seed"]): run["curve"][-1]["psnr"] for run in runs if way(run) == base}
+    pairs = [run for run in runs if way(run) == a and (run["scene"], run["seed"]) in goals]
+    times = [seconds_to(run["curve"], goals[run["scene"], run["seed"]]) for run in pairs]
+    return [time for time in times if time is not None], len(pairs)
+
+
+def mean_curve(runs: Sequence[Run], metric: str) -> list[tuple[float, float]]:
+    """(CPU seconds, metric) at each look, both averaged over runs; looks that some run lacks are left out."""
+    points = []
+    for step in sorted({look["step"] for run in runs for look in run["curve"]}):
+        looks = [look for run in runs for look in run["curve"] if look["step"] == step and look[metric] is not None]
+        if len(looks) == len(runs):
+            seconds = statistics.fmean(look["cpu_seconds"] for look in looks)
+            points.append((seconds, statistics.fmean(look[metric] for look in looks)))
+    return points
+
+
+def complete(runs: Sequence[Run], ways: Sequence[Way]) -> list[Way]:
+    """`ways` without arms of words that lack a scene or seed: of some a language model has nothing to say."""
+    made = {one: {(run["scene"], run["seed"]) for run in runs if way(run) == one} for one in ways}
+    every = set().union(*made.values())
+    return [one for one in ways if one[0] not in arm_flags.WORDS or made[one] == every]
+
+
+def common(runs: Sequence[Run], ways: Sequence[Way]) -> list[Run]:
+    """The runs of those scenes and seeds that every one of `ways` has."""
+    keys = [{(run["scene"], run["seed"]) for run in runs if way(run) == one} for one in ways]
+    kept = set.intersection(*keys) if keys else set()
+    return [run for run in runs if (run["scene"], run["seed"]) in kept and way(run) in ways]

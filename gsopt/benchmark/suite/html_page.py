@@ -1,0 +1,147 @@
+"""One page of a suite that needs no other file: tables, charts and the grid of pictures."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from gsopt import __version__
+from gsopt.benchmark.suite import definition as declared
+from gsopt.benchmark.suite.aggregate import Way
+from gsopt.benchmark.suite.tables import Part, about, missing, parts
+from gsopt.errors import InputError
+from gsopt.events import write_atomic
+
+# Nothing may be loaded from anywhere: pictures are data URIs, styles stand in the page, there are no scripts.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+STYLE = (
+    ".grid{border-spacing:6px;border-collapse:separate}.grid td{padding:0;vertical-align:top;text-align:center}"
+    ".grid img{display:block;width:150px;height:auto}.grid td.none{color:#888}svg{max-width:540px;height:auto}"
+    ".charts{display:flex;flex-wrap:wrap;gap:1rem}"
+)
+PREFIX = "data:image/webp;base64,"
+CELL, ROOM, QUALITY = 150, 6, 85
+
+
+def write_html(document: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
+    """Write the page."""
+    write_atomic(path, page(document, pictures).encode())
+
+
+def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
+    suite = declared.load(document["suite"])
+    style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
+    lines = "".join(f"<p>{marked(line)}</p>" for line in about(document))
+    sections = "".join(section(made, pictures) for made in parts(document))
+    rest = "".join(f"<li>{marked(line)}</li>" for line in missing(document))
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
+        f'content="light dark"><link rel="icon" href="data:,"><title>{escape(suite.title)} · gsopt bench</title>'
+        f"<style>\n{style}{STYLE}</style></head>\n<body><main><header><p class='eyebrow'>gsopt bench --suite "
+        f"{escape(suite.name)}</p><h1>{escape(suite.title)}</h1></header>{lines}{sections}"
+        f"<section><h2>What is missing</h2><ul>{rest or '<li>Nothing.</li>'}</ul></section></main>"
+        f"<footer><p>gsopt {__version__}</p></footer></body></html>\n"
+    )
+
+
+def marked(text: str) -> str:
+    """Escaped, with what stands between backticks as code."""
+    return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
+
+
+def section(made: Part, pictures: dict[str, Any]) -> str:
+    """A group: tables, charts, pictures."""
+    out = [f"<section><h2>{escape(made.title)}</h2><p>{marked(' '.join(made.lines))}</p>"]
+    for note, (head, rows) in made.tables:
+        cells = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+        body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        out.append(f"<p class='muted'>{escape(note)}</p>")
+        out.append(f'<div class="scroll"><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>')
+    out.append(f'<div class="charts">{"".join(made.charts.values())}</div>')
+    return "".join(out) + grid(made, pictures) + "</section>\n"
+
+
+def grid(made: Part, pictures: dict[str, Any]) -> str:
+    """Input, every arm with its error below, truth; '' without pictures."""
+    rows = "".join(grid_row(made, scene, pictures) for scene in made.scenes)
+    if not rows:
+        return ""
+    names = "".join(f"<th>{escape(arm)}<br>{steps:,}</th>" for arm, steps in made.ways)
+    note = (
+        "The held-out view that stands farthest from all input views, chosen before any result, and the input view "
+        "nearest to it; below each render its error (dark: none, bright: a quarter of the range and more). Seed 0."
+    )
+    head = f"<tr><th></th><th>nearest input</th>{names}<th>truth</th></tr>"
+    return f"<p class='muted'>{note}</p><div class='scroll'><table class='grid'>{head}{rows}</table></div>"
+
+
+def grid_row(made: Part, scene: str, pictures: dict[str, Any]) -> str:
+    shared = pictures.get(f"{scene}|{made.views}")
+    if not isinstance(shared, dict):
+        return ""
+    cells = [f"<td>{escape(scene.rpartition('/')[2])}</td>", _cell(shared, "input")]
+    for one in made.ways:
+        found = find(pictures, scene, made.views, one)
+        cells.append("<td class='none'>no run</td>" if found is None else _cell(found, "render", "error"))
+    return f"<tr>{''.join(cells)}{_cell(shared, 'truth')}</tr>"
+
+
+def find(pictures: dict[str, Any], scene: str, views: str, one: Way) -> dict[str, Any] | None:
+    """Pictures of a run of seed 0, whatever its group."""
+    ending = f"|{scene}|{views}|{one[0]}|{one[1]}|0"
+    return next((value for key, value in pictures.items() if key.endswith(ending)), None)
+
+
+def _cell(found: dict[str, Any], *names: str) -> str:
+    sources = [str(found.get(name, "")) for name in names]
+    shown = "".join(f'<img loading="lazy" src="{escape(s)}" alt="">' for s in sources if s.startswith(PREFIX))
+    return f"<td>{shown}</td>"
+
+
+def write_grid(document: dict[str, Any], pictures: dict[str, Any], path: Path, most: int = 12) -> bool:
+    """The rows of the first part that have all of input, 3dgs, ours-0, ours, truth and the error of ours, as one JPEG;
+    False when there is none."""
+    for made in parts(document):
+        rows = [row for scene in made.scenes if (row := _pictures(made, scene, pictures))][:most]
+        if rows:
+            sheet = Image.new("RGB", (len(rows[0]) * (CELL + ROOM), len(rows) * (CELL + ROOM)), "white")
+            for y, row in enumerate(rows):
+                for x, uri in enumerate(row):
+                    sheet.paste(decoded(uri).resize((CELL, CELL)), (x * (CELL + ROOM), y * (CELL + ROOM)))
+            buffer = io.BytesIO()
+            sheet.save(buffer, format="JPEG", quality=QUALITY)
+            write_atomic(path, buffer.getvalue())
+            return True
+    return False
+
+
+def _pictures(made: Part, scene: str, pictures: dict[str, Any]) -> Sequence[str]:
+    """Data URIs of a whole row; () when one is missing."""
+    steps = made.ways[0][1]
+    shared = pictures.get(f"{scene}|{made.views}")
+    found = [find(pictures, scene, made.views, (arm, steps)) for arm in ("3dgs", "ours-0", "ours")]
+    if not isinstance(shared, dict) or not all(isinstance(one, dict) for one in found):
+        return ()
+    renders = [str(one["render"]) for one in found if one is not None]
+    return [str(shared["input"]), *renders, str(shared["truth"]), str((found[-1] or {})["error"])]
+
+
+def decoded(uri: str) -> Image.Image:
+    """The picture of a data URI that `gsopt bench` wrote; InputError for anything else."""
+    try:
+        if not uri.startswith(PREFIX):
+            raise ValueError("no WebP data URI")
+        with Image.open(io.BytesIO(base64.b64decode(uri[len(PREFIX) :], validate=True)), formats=("WEBP",)) as image:
+            return image.convert("RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"A picture of the suite cannot be read: {error}. Make its runs again.") from error

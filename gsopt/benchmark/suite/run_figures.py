@@ -1,0 +1,122 @@
+"""What a suite looks at in a finished run beside metrics.json: its course, its shape, its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.benchmark.scenes import time_at
+from gsopt.data.scene import Scene, View
+from gsopt.formats import load_splats
+from gsopt.results.evaluation import DIGITS, evaluate_views
+from gsopt.results.finished_run import FinishedRun, truth
+from gsopt.results.report.pictures import data_uri, error_map, shrunk
+from gsopt.results.video import as_image
+
+CURVE_VIEWS = 8
+"""Held-out views that are judged on the way, evenly spread."""
+SOLID = 0.5
+"""A pixel with more alpha than this belongs to the object."""
+SIDE = 256
+LARGEST_DEPTH = 1 << 28
+
+Event = Mapping[str, Any]
+
+
+@torch.no_grad()
+def curve(finished: FinishedRun, scene: Scene, events: Sequence[Event], setup: float) -> list[dict[str, Any]]:
+    """Held-out quality at every preview and at the end (`suite_file.LOOK`), over CPU seconds."""
+    count = min(CURVE_VIEWS, len(scene.test))
+    views = [scene.test[i * len(scene.test) // count] for i in range(count)]
+    steps = int(events[-1]["step"])
+    previews = [event for event in events if event["kind"] == "preview" and event["step"] < steps]
+    moments = [(event["step"], finished.path / event["path"]) for event in previews]
+    moments.append((steps, finished.path / "splat.ply"))
+    looks = []
+    for step, path in moments:
+        gaussians = load_splats(path)
+        judged = evaluate_views(
+            gaussians, views, finished.backend, finished.settings, finished.background, None, vgg=False
+        )
+        looks.append(
+            {
+                "step": step,
+                "cpu_seconds": round(setup + time_at(step, events)[0], 2),
+                "gaussians": len(gaussians),
+                "psnr": judged["mean"]["psnr"],
+                "lpips_alex": judged["mean"]["lpips_alex"],
+            }
+        )
+    return looks
+
+
+@torch.no_grad()
+def shape(finished: FinishedRun, scene: Scene) -> dict[str, list[float | None]]:
+    """Per held-out view: overlap of silhouettes, and mean depth error in scene units; None without truth for it."""
+    rows = [_shape_of(finished, scene, view) for view in scene.test]
+    return {"mask_iou": [iou for iou, _ in rows], "depth_error": [depth for _, depth in rows]}
+
+
+def _shape_of(finished: FinishedRun, scene: Scene, view: View) -> tuple[float | None, float | None]:
+    pixels = view.pixels()
+    depth = read_depth(scene.path, view)
+    if pixels.shape[2] < 4 and depth is None:
+        return None, None
+    camera = view.camera.to(finished.gaussians.means.dtype)
+    frame = finished.backend.forward(finished.gaussians, camera, finished.settings, None, depth=True)
+    solid = frame.alphas > SOLID
+    iou = overlap(solid, pixels[..., 3] > 255 * SOLID) if pixels.shape[2] == 4 else None
+    if depth is None or frame.depths is None:
+        return iou, None
+    both = solid & (depth > 0)
+    if not bool(both.any()):
+        return iou, None
+    error = (frame.depths[both] / frame.alphas[both] - depth[both]).abs().double().mean()
+    return iou, round(float(error), DIGITS)
+
+
+def overlap(a: Tensor, b: Tensor) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    union = int((a | b).sum())
+    return round(int((a & b).sum()) / union, DIGITS) if union else 1.0
+
+
+def read_depth(root: Path, view: View) -> Float[Tensor, "H W"] | None:
+    """depth/NAME.npy as synth_views writes it: z in scene units, 0 where nothing is. None where there is none that
+    fits the view's size, or that is no plain array of numbers."""
+    path = root / "depth" / f"{Path(view.name).stem}.npy"
+    if not path.is_file() or path.stat().st_size > LARGEST_DEPTH:
+        return None
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    if not isinstance(values, np.ndarray) or values.shape != (view.camera.height, view.camera.width):
+        return None
+    return torch.from_numpy(values.astype(np.float32))
+
+
+@torch.no_grad()
+def pictures(finished: FinishedRun, scene: Scene) -> tuple[dict[str, str], dict[str, str]]:
+    """What a scene's row of the grid needs, and what this run adds: the held-out view that stands farthest from all
+    input views (chosen without looking at any result), and the input view nearest to it."""
+    view, nearest = remote_view(scene)
+    target, picture = as_image(truth(view, finished.background)), as_image(finished.draw(view.camera))
+    shared = {"view": view.name, "truth": data_uri(shrunk(target, SIDE)), "input_view": nearest.name}
+    shared["input"] = data_uri(shrunk(as_image(truth(nearest, finished.background)), SIDE))
+    error = error_map(picture, target)
+    return shared, {"render": data_uri(shrunk(picture, SIDE)), "error": data_uri(shrunk(error, SIDE))}
+
+
+def remote_view(scene: Scene) -> tuple[View, View]:
+    """The held-out view whose nearest input camera is farthest away, and that input view."""
+    inputs = torch.cat([view.camera.centers for view in scene.train])
+    distances = torch.stack([(inputs - view.camera.centers).norm(dim=1) for view in scene.test])
+    row = int(distances.min(dim=1).values.numpy().argmax())
+    return scene.test[row], scene.train[int(distances[row].numpy().argmin())]

@@ -1,0 +1,81 @@
+"""Makes the runs of a suite that have no record yet, one after the other, and writes after each."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsopt.benchmark.machine import machine
+from gsopt.benchmark.suite import result_file, single_run
+from gsopt.benchmark.suite.definition import Case
+from gsopt.benchmark.suite.single_run import Bench, RunFailed
+
+Tell = Callable[[str], None]
+
+
+def work_folder(path: Path) -> Path:
+    """Where the runs of a result file lie while they are made."""
+    return path.with_name(f"{path.stem}-runs")
+
+
+def run_suite(path: Path, suite: str, command: str, cases: Sequence[Case], bench: Bench, tell: Tell) -> list[str]:
+    """Bring the result file up to date with `cases`; returns what failed. A kill loses the run that was being made.
+
+    Raises UsageError and InputError for a file of another suite or a broken one, before anything is run.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with result_file.locked(path):
+        document = result_file.opened(path, suite, command)
+        bench.work.mkdir(parents=True, exist_ok=True)
+        for stale in bench.work.glob("run-*"):  # of a killed call
+            shutil.rmtree(stale, ignore_errors=True)
+        torch.set_num_threads(1)
+        failed: list[str] = []
+        for number, case in enumerate(cases, 1):
+            document, told = _one(path, document, case, bench)
+            if told:
+                tell(f"{number}/{len(cases)} {told}")
+            failed += [case.id] if " failed: " in told else []
+        return failed
+
+
+def _one(path: Path, document: dict[str, Any], case: Case, bench: Bench) -> tuple[dict[str, Any], str]:
+    """The document after one case, written when it changed, and what there is to tell."""
+    told, old = "", next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
+    if (reason := single_run.reason_to_skip(case, bench)) is not None:
+        skip = {**_named(case), "reason": reason}
+        if old is not None or skip in document["skipped"]:  # a record made where a prior was at hand stays
+            return document, ""
+        document = result_file.with_skip(document, skip)
+    else:
+        try:
+            if old is not None and old["key"] == single_run.key(case, bench):
+                return document, ""
+            record, protocol, pictures = single_run.measure(case, bench)
+        except RunFailed as error:
+            return document, f"{case.id} failed: {error}"
+        document = result_file.with_run(document, record, machine(), protocol)
+        if pictures:
+            result_file.write_pictures(path, {**result_file.read_pictures(path), **pictures})
+        told = line(record)
+    result_file.write(path, document)
+    return document, told
+
+
+def _named(case: Case) -> dict[str, Any]:
+    return {name: value for name, value in asdict(case).items() if name in result_file.ID}
+
+
+def line(record: dict[str, Any]) -> str:
+    """A run in one line of the printed table."""
+    mean = record["mean"]
+    seconds = record["setup_cpu_seconds"] + record["train_cpu_seconds"]
+    return (
+        f"{record['scene']}, {record['views_in']} views, {record['arm']}, {record['iterations']} steps, "
+        f"seed {record['seed']}: {mean['psnr']:.2f} dB, LPIPS {mean['lpips_alex']}, {seconds:.0f} s CPU"
+    )

@@ -1,0 +1,247 @@
+"""One run of a suite: `gsopt train` in a process of its own, then every figure of it as one record."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsopt.benchmark.suite import arm_flags, run_key
+from gsopt.benchmark.suite.definition import LOOKS, Case
+from gsopt.benchmark.suite.result_file import METRICS
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.train import DataConfig
+from gsopt.data.scene import load_scene
+from gsopt.errors import GsoptError, InputError
+from gsopt.events import read_events
+from gsopt.llm_prompts.schema import read_set, write_prompts
+from gsopt.metrics import find_vgg_weights
+from gsopt.results.evaluation import read_metrics
+from gsopt.results.finished_run import open_run
+from gsopt.sds.select_prior import EMBEDDED, choose, fitting
+
+TOLD = 12
+"""Last lines of a failed run's output that are repeated."""
+
+
+class RunFailed(GsoptError):
+    """`gsopt train` ended with an error; the suite goes on without this run."""
+
+    exit_code = 3
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What the runs of one call share."""
+
+    root: Path
+    work: Path
+    """Folder of the runs; each is removed once its record is written."""
+    threads: int
+    prior: str = ""
+    """Of guided arms; gsopt's own choice when not given."""
+    llm: str = ""
+    model: str = ""
+
+
+def reason_to_skip(case: Case, bench: Bench) -> str | None:
+    """Why a run would say nothing; None when it is to be made."""
+    if not arm_flags.is_guided(case.arm):
+        return None
+    config = GuidanceConfig(prior=bench.prior or "auto")
+    choice = choose(config)
+    if choice.prior is not None and not bench.prior:
+        views = load_scene(data_config(case, bench.root))
+        choice = fitting(choice, config, len(views.train), views.has_alpha)
+    if choice.prior is None:
+        return f"the same as ours-0, not guided: {choice.reason}"
+    if case.arm not in arm_flags.WORDS:
+        return None
+    return _no_words(case, bench, choice.prior)
+
+
+def _no_words(case: Case, bench: Bench, prior: str) -> str | None:
+    from gsopt.sds.load_prior import open_prior
+
+    if open_prior(prior, GuidanceConfig(prior=prior)).encoder() is None:
+        return f"the prior {prior} takes no words: prompts cannot change anything"
+    if case.arm == "ours-llm" and not bench.llm:
+        return "no language model named: --llm URL"
+    if case.scene not in notes(bench.root):
+        return f"no words for {case.scene} in notes.json below the root"
+    return None
+
+
+def notes(root: Path) -> dict[str, Any]:
+    """By scene what an expert would say: {"notes": ..., "domain": ..., "category": ...}."""
+    from gsopt.data.files import read_json
+
+    path = root / "notes.json"
+    return read_json(path) if path.exists() else {}
+
+
+def data_config(case: Case, root: Path) -> DataConfig:
+    """What the flags of the run say about its data."""
+    flags = list(case.flags)
+    after = {name: flags[flags.index(name) + 1] for name in ("--views", "--view-ids", "-r") if name in flags}
+    ids = tuple(int(part) for part in after["--view-ids"].split(",")) if "--view-ids" in after else None
+    views = int(after["--views"]) if "--views" in after else None
+    factor = int(after.get("-r", 1))
+    return DataConfig(str(root / case.scene), views=views, view_ids=ids, downscale=factor, eval="--eval" in flags)
+
+
+def settings(case: Case, bench: Bench) -> list[str]:
+    """Everything that the run's figures depend on beside its data and the code."""
+    own = [*case.flags, f"looks={LOOKS}"]
+    vgg = find_vgg_weights()
+    own.append("vgg=" + ("none" if vgg is None else run_key.file_hash(vgg).hex()))
+    if arm_flags.is_guided(case.arm):
+        folder = Path(bench.prior) if bench.prior and Path(bench.prior).is_dir() else EMBEDDED
+        own.append(f"prior={bench.prior or 'auto'} {run_key.folder_hash(folder.absolute())}")
+    if (path := prompts(case, bench)) is not None:
+        own.append("prompts=" + run_key.file_hash(path).hex())
+    return own
+
+
+def key(case: Case, bench: Bench) -> str:
+    """Hash of settings, data and code: a record with the same key is this run."""
+    data = run_key.folder_hash((bench.root / case.scene).absolute())
+    return run_key.key(settings(case, bench), data, run_key.code_hash())
+
+
+def prompts(case: Case, bench: Bench) -> Path | None:
+    """The arm's prompts.json, made once per scene; None for an arm without words."""
+    if case.arm not in arm_flags.WORDS:
+        return None
+    note = notes(bench.root)[case.scene]
+    asked = hashlib.sha256(json.dumps([note, bench.llm, bench.model, run_key.code_hash()]).encode()).hexdigest()[:12]
+    path = bench.work / "prompts" / f"{case.scene.replace('/', '-')}-{case.arm}-{asked}.json"
+    if path.exists():
+        return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    every = path.with_name(f"all-{path.name}")
+    domain = str(note.get("domain", "generic"))
+    if (bench.root / domain).is_file():  # a template of one's own, named relative to notes.json
+        domain = str((bench.root / domain).absolute())
+    command = ["prompts", "--notes", str(note["notes"]), "--domain", domain]
+    command += ["--category", str(note["category"])] if "category" in note else []
+    command += ["--llm", bench.llm, "--model", bench.model] if case.arm == "ours-llm" else []
+    call([*command, "-o", str(every), "--overwrite"], path.with_suffix(".log"))
+    found = read_set(every).prompts
+    write_prompts(path, [prompt for prompt in found if prompt.source.startswith(arm_flags.WORDS[case.arm])])
+    return path
+
+
+def machine_flags(case: Case, bench: Bench) -> list[str]:
+    """Flags that change how fast a run is and where its previews lie, not a bit of its result."""
+    flags = ["--threads", str(bench.threads), "--checkpoint-every", "0"]
+    flags += ["--preview-every", str(max(1, case.iterations // LOOKS))]
+    if arm_flags.is_guided(case.arm) and bench.prior:
+        flags += ["--prior", bench.prior]
+    path = prompts(case, bench)
+    return flags if path is None else [*flags, "--prompts", str(path)]
+
+
+def call(arguments: list[str], log: Path) -> None:
+    """`gsopt ARGUMENTS` with this Python and this package; RunFailed with the end of its output."""
+    with open(log, "wb") as output:
+        done = subprocess.run(
+            [sys.executable, "-m", "gsopt", *arguments],
+            cwd=run_key.PACKAGE.parent,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            check=False,
+        )
+    if done.returncode in (-signal.SIGINT, -signal.SIGTERM, 130):
+        raise KeyboardInterrupt
+    if done.returncode:
+        last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-TOLD:]
+        raise RunFailed(
+            f"`gsopt {' '.join(arguments)}` ended with exit code {done.returncode}: {' / '.join(last)}. "
+            "Mend that and call the suite again: it makes only what is missing."
+        )
+
+
+def measure(case: Case, bench: Bench) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """Train and judge: the record (`suite_file.RUN` without its references), the protocol, the pictures of seed 0."""
+    folder = Path(tempfile.mkdtemp(prefix="run-", dir=bench.work))
+    try:
+        run = folder / "run"
+        arguments = ["train", str(bench.root / case.scene), "-m", str(run), *case.flags, *machine_flags(case, bench)]
+        call(arguments, folder / "output.txt")
+        return recorded(case, bench, run)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def recorded(case: Case, bench: Bench, run: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """Every figure of a finished run."""
+    from gsopt.benchmark.suite import run_figures
+
+    metrics, events = read_metrics(run), read_events(run / "events.jsonl")[0]
+    if events[-1]["kind"] != "done":
+        raise RunFailed(f"{case.id} must end with `done`, got {events[-1]['kind']!r}. Call the suite again.")
+    if not metrics.get("per_view"):
+        raise InputError(f"{case.scene} holds out no views, so nothing can be judged. Add --eval to its group.")
+    finished = open_run(run, threads=bench.threads)
+    scene = load_scene(finished.config.data)
+    started = next(event for event in events if event["kind"] == "started")
+    setup = float(started.get("setup_cpu_seconds", 0.0))
+    per_view = {name: [row[name] for row in metrics["per_view"]] for name in METRICS[:4]}
+    per_view |= run_figures.shape(finished, scene)
+    record = {
+        "group": case.group,
+        "scene": case.scene,
+        "views": case.views,
+        "arm": case.arm,
+        "iterations": case.iterations,
+        "seed": case.seed,
+        "key": key(case, bench),
+        "flags": list(case.flags),
+        "views_in": len(scene.train),
+        "views_out": [row["name"] for row in metrics["per_view"]],
+        "per_view": per_view,
+        "mean": {name: mean(values) for name, values in per_view.items()},
+        "curve": run_figures.curve(finished, scene, events, setup),
+        "curve_views": min(run_figures.CURVE_VIEWS, len(scene.test)),
+        "setup_cpu_seconds": round(setup, 2),
+        "train_cpu_seconds": round(metrics["train_cpu_seconds"], 2),
+        "peak_memory_mb": metrics["peak_memory_mb"],
+        "n_gaussians": metrics["n_gaussians"],
+        "init": metrics["init"],
+        "guidance": guidance_facts(run),
+        "code": run_key.code_hash(),
+    }
+    pictures: dict[str, Any] = {}
+    if case.seed == 0:
+        pictures[f"{case.scene}|{case.views}"], pictures[case.id] = run_figures.pictures(finished, scene)
+    return record, metrics["protocol"], pictures
+
+
+def mean(values: list[float | None]) -> float | None:
+    """Over views; None when one lacks the value."""
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known), 6) if known and len(known) == len(values) else None
+
+
+def guidance_facts(run: Path) -> dict[str, Any]:
+    """Who guided the run, why, and what the guard made of it."""
+    found = json.loads((run / "config.json").read_bytes()).get("guidance") or {}
+    guard = found.get("guard") or {}
+    factor = guard.get("factor")
+    return {
+        "prior": found.get("prior"),
+        "reason": str(found.get("reason", "")),
+        "factor": None if factor is None else float(factor),
+        "guard": str(guard.get("reason", "")),
+    }

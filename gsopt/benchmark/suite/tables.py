@@ -1,0 +1,246 @@
+"""The tables and charts of a suite, made from its result file alone: as parts that Markdown and HTML both show."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsopt.benchmark.charts import Axis, Series, chart
+from gsopt.benchmark.document import replace_block, table
+from gsopt.benchmark.suite import aggregate, arm_flags
+from gsopt.benchmark.suite import definition as declared
+from gsopt.benchmark.suite.aggregate import Difference, Run, Way, way
+from gsopt.benchmark.suite.definition import Group, Suite, view_count
+from gsopt.events import write_atomic
+
+METRICS = {
+    "psnr": ("PSNR", 2),
+    "ssim": ("SSIM", 4),
+    "lpips_alex": ("LPIPS Alex", 4),
+    "lpips_vgg": ("LPIPS VGG", 4),
+    "mask_iou": ("mask IoU", 4),
+    "depth_error": ("depth error", 4),
+}
+COMPARED = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+SEEDS = 3
+Table = tuple[list[str], list[list[str]]]
+
+
+@dataclass
+class Part:
+    """One group at one number of views: what a page shows of it."""
+
+    title: str
+    lines: list[str] = field(default_factory=list)
+    tables: list[tuple[str, Table]] = field(default_factory=list)
+    """With the sentence above each."""
+    charts: dict[str, str] = field(default_factory=dict)
+    """SVG by file name without suffix."""
+    scenes: list[str] = field(default_factory=list)
+    """Of the picture grid, in the suite's order."""
+    views: str = ""
+    ways: list[Way] = field(default_factory=list)
+
+
+def parts(document: dict[str, Any]) -> list[Part]:
+    """Every group and number of views that has a run, in the suite's order."""
+    suite = declared.load(document["suite"])
+    return [
+        part(suite, group, views, found)
+        for group in suite.groups
+        for views in group.views
+        if (found := [r for r in document["runs"] if r["group"] == group.name and r["views"] == views])
+    ]
+
+
+def part(suite: Suite, group: Group, views: str, runs: list[Run]) -> Part:
+    """The tables of runs that were learned alike."""
+    ways = [one for one in group.runs if any(way(run) == one for run in runs)]
+    several = len(group.views) > 1
+    title = group.title + (f": {view_count(views)} views" if several else "")
+    made = Part(title, [group.why], views=views, ways=ways)
+    made.scenes = [scene for scene in group.scenes if any(run["scene"] == scene for run in runs)]
+    seeds = sorted({run["seed"] for run in runs})
+    which = ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
+    made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, {which}.")
+    whole = aggregate.complete(runs, ways)
+    same = aggregate.common(runs, whole)
+    note = "Means over scenes, seeds averaged first; " + ("what every arm has." if same else "arms differ in scenes.")
+    if lacking := [_name(one) for one in ways if one not in whole] if same else []:
+        note += f" Not of {', '.join(lacking)}, where scenes or seeds are missing."
+    made.tables.append((note, figures(same or runs, whole if same else ways)))
+    pairs = list(comparisons(group, ways))
+    if rows := [row for a, b in pairs if (row := compared(runs, a, b))]:
+        what = "scenes" if len(made.scenes) > 1 else "seeds of the one scene"
+        head = ["paired difference", what, *(f"Δ {METRICS[m][0]}" for m in COMPARED), "PSNR worst", "PSNR better in"]
+        made.tables.append(("Mean with its 95 % confidence interval (Student's t); losses included.", (head, rows)))
+    if len(ways) > 1 and (rows := [row for a in ways if (row := time_row(runs, a, ways[0]))]):
+        note = f"CPU seconds until a run is as good as {_name(ways[0])} ends on the same scene (PSNR of "
+        note += f"{max(run['curve_views'] for run in runs)} held-out views, looked at {declared.LOOKS} times)."
+        made.tables.append((note, (["arm", "median of those that get there", "get there", "whole run, median"], rows)))
+    if len(made.scenes) > 1:
+        made.tables.append(("PSNR of every scene.", scene_rows(runs, made.scenes, ways)))
+    made.charts = charts(f"suite-{suite.name}-{group.name}" + (f"-{view_count(views)}" if several else ""), made, runs)
+    return made
+
+
+def figures(runs: Sequence[Run], ways: Sequence[Way]) -> Table:
+    """Means of every arm."""
+    shown = [m for m in METRICS if any(run["mean"][m] is not None for run in runs)]
+    head = ["arm", "scenes", *(METRICS[m][0] for m in shown), "Gaussians", "CPU s", "peak MB"]
+    rows = []
+    for one in ways:
+        mine = [run for run in runs if way(run) == one]
+        row = [_name(one), str(len({run["scene"] for run in mine}))]
+        for metric in shown:
+            values = aggregate.by_scene(mine, metric).values()
+            row.append(f"{statistics.fmean(values):.{METRICS[metric][1]}f}" if values else "")
+        row.append(f"{statistics.fmean(run['n_gaussians'] for run in mine):,.0f}")
+        row.append(f"{statistics.fmean(seconds(run) for run in mine):.0f}")
+        peaks = [run["peak_memory_mb"] for run in mine if run["peak_memory_mb"] is not None]
+        rows.append([*row, f"{statistics.fmean(peaks):.0f}" if peaks else ""])
+    return head, rows
+
+
+def seconds(run: Run) -> float:
+    """CPU seconds of reading, first Gaussians, the guard and all steps."""
+    return float(run["setup_cpu_seconds"] + run["train_cpu_seconds"])
+
+
+def comparisons(group: Group, ways: Sequence[Way]) -> Iterator[tuple[Way, Way]]:
+    """Each arm against the group's first; guided against unguided; ours against 3dgs that ran longer."""
+    base = ways[0]
+    for one in ways[1:]:
+        yield one, base
+    for arm, steps in ways:
+        if arm_flags.is_guided(arm) and ("ours-0", steps) in ways:
+            yield (arm, steps), ("ours-0", steps)
+    for arm, steps in ways:
+        longer = [(a, n) for a, n in ways if a == base[0] and n > steps and (a, n) != base]
+        yield from (((arm, steps), other) for other in longer if arm != base[0])
+
+
+def compared(runs: Sequence[Run], a: Way, b: Way) -> list[str]:
+    """A row of the table of differences; [] without a pair."""
+    found = {m: aggregate.summarized(aggregate.differences(runs, a, b, m)) for m in COMPARED}
+    psnr = found["psnr"]
+    if psnr is None:
+        return []
+    row = [f"{_name(a)} less {_name(b)}", str(psnr.count)]
+    row += [_interval(found[m], METRICS[m][1]) for m in COMPARED]
+    return [*row, f"{psnr.lowest:+.2f}", f"{psnr.positive} of {psnr.count}"]
+
+
+def _interval(found: Difference | None, digits: int) -> str:
+    if found is None:
+        return ""
+    return f"{found.mean:+.{digits}f}" + ("" if found.half is None else f" ± {found.half:.{digits}f}")
+
+
+def time_row(runs: Sequence[Run], a: Way, base: Way) -> list[str]:
+    times, pairs = aggregate.reached(runs, a, base)
+    if not pairs:
+        return []
+    whole = statistics.median(seconds(run) for run in runs if way(run) == a)
+    median = f"{statistics.median(times):.0f} s" if times else ""
+    return [_name(a), median, f"{len(times)} of {pairs}", f"{whole:.0f} s"]
+
+
+def scene_rows(runs: Sequence[Run], scenes: Sequence[str], ways: Sequence[Way]) -> Table:
+    """One row per scene; the seeds that its arms share averaged; what the guard left of the guidance."""
+    rows = []
+    for scene in scenes:
+        row = [scene.rpartition("/")[2]]
+        here = [run for run in runs if run["scene"] == scene]
+        here = aggregate.common(here, [one for one in ways if any(way(run) == one for run in here)]) or here
+        for one in ways:
+            value = aggregate.by_scene([run for run in here if way(run) == one], "psnr").get(scene)
+            row.append("" if value is None else f"{value:.2f}")
+        factors = [run["guidance"]["factor"] for run in here]
+        rows.append([*row, ", ".join(f"{factor:g}" for factor in factors if factor is not None)])
+    return ["scene", *(_name(one) for one in ways), "guard's factor"], rows
+
+
+def charts(stem: str, made: Part, runs: Sequence[Run]) -> dict[str, str]:
+    """Quality over CPU seconds of the arms that lack no scene, over the scenes and seeds that all of these have."""
+    whole = aggregate.complete(runs, made.ways)
+    same = aggregate.common(runs, whole)
+    if not same:
+        return {}
+    drawn = {}
+    for metric, label in (("psnr", "PSNR, dB"), ("lpips_alex", "LPIPS (Alex), lower is better")):
+        series = [Series(_name(one), aggregate.mean_curve([r for r in same if way(r) == one], metric)) for one in whole]
+        title = f"{made.title} ({_count(len({run['scene'] for run in same}), 'scene')})"
+        drawn[f"{stem}-{metric.partition('_')[0]}"] = chart(title, Axis("CPU seconds"), Axis(label), series)
+    return drawn
+
+
+def about(document: dict[str, Any]) -> list[str]:
+    """Where the figures come from, how they were taken, and what is missing."""
+    places = [f"{m['cpu']}, {m['cores']} cores, gsopt {m['commit'] or m['gsopt']}" for m in document["machines"]]
+    codes = Counter(run["code"] for run in document["runs"])
+    mixed = "" if len(codes) < 2 else f" The runs are of {len(codes)} versions of the code: call the suite again."
+    suite = declared.load(document["suite"])
+    lines = [suite.about.replace("\n", " "), f"`{document['command']}` on {'; '.join(places)}.{mixed}"]
+    lines.append(
+        "CPU seconds of all threads: reading, first Gaussians, the guard's short runs and the steps; other work on the "
+        "machine slows them by sharing caches, but does not add to them."
+    )
+    if document["protocols"]:
+        lines.append("Protocol: " + document["protocols"][0].partition("; background")[0] + ".")
+    return lines
+
+
+def missing(document: dict[str, Any]) -> list[str]:
+    """What the suite declares (three seeds) and the file does not have, and what was skipped and why."""
+    suite = declared.load(document["suite"])
+    have = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["runs"]}
+    skipped = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["skipped"]}
+    lines, lacking = [], Counter[str]()
+    for case in declared.cases(suite, SEEDS):
+        known = (case.group, case.scene, case.views, case.arm, case.iterations, case.seed)
+        if known not in have and known not in skipped:
+            begun = any(run["seed"] == case.seed for run in document["runs"])
+            where = f"{case.group}, {view_count(case.views)} views, " if begun else ""
+            lacking[f"{where}seed {case.seed}"] += 1
+    if lacking:
+        lines.append("Not run yet: " + "; ".join(f"{what} ({count} runs)" for what, count in lacking.items()) + ".")
+    reasons: dict[str, Counter[str]] = {}
+    for skip in document["skipped"]:
+        reasons.setdefault(skip["reason"], Counter())[skip["arm"]] += 1
+    for reason, arms in reasons.items():
+        lines.append("Skipped: " + ", ".join(f"{arm} ({count})" for arm, count in arms.items()) + f": {reason}.")
+    return lines
+
+
+def write_page(document: dict[str, Any], page: Path) -> None:
+    """Rewrite the block of the suite in a Markdown page and the charts beside it, in img/."""
+    blocks = [*about(document)]
+    for made in parts(document):
+        blocks += [f"### {made.title}", " ".join(made.lines)]
+        for note, (head, rows) in made.tables:
+            blocks += [note, table(head, rows)]
+        for name, svg in made.charts.items():
+            write_atomic(_folder(page) / f"{name}.svg", svg.encode())
+        if made.charts:
+            blocks.append("\n".join(f"![{made.title}](img/{name}.svg)" for name in made.charts))
+    blocks.append("\n".join(f"- {line}" for line in missing(document)))
+    replace_block(page, document["suite"], "\n\n".join(blocks))
+
+
+def _folder(page: Path) -> Path:
+    folder = page.parent / "img"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def _name(one: Way) -> str:
+    return f"{one[0]}, {one[1]:,}"
+
+
+def _count(count: int, thing: str) -> str:
+    return f"{count} {thing}{'' if count == 1 else 's'}"

@@ -1,0 +1,1 @@
+"""Mathematics that several packages share: cameras, rotations, projection, voxels, harmonics."""

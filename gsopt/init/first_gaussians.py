@@ -1,0 +1,131 @@
+"""The first Gaussians of a run: which method, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt import check
+from gsopt.config.train import InitConfig
+from gsopt.data.scene import Scene
+from gsopt.errors import UsageError
+from gsopt.gaussians import Gaussians
+from gsopt.geometry.projection import find_focus
+from gsopt.init.frustum import random_points
+from gsopt.init.hull import hull_points
+from gsopt.init.points import gaussians_at
+from gsopt.init.stereo.points import stereo_points
+from gsopt.init.thumbnails import mean_colors, small_photos
+
+ENOUGH_POINTS = 100
+"""Sparse points from which on they beat the hull and random points."""
+ENOUGH_AGREED = 0.05
+"""Share of the pixels on which two photos must agree: photos of different rooms agree on 0.03 by chance."""
+FEW_PHOTOS = 10
+"""So many find their depth better by stereo, more of them from random points (docs/decisions/0003-stereo.md)."""
+_COLOR_PHOTOS = 16
+Made = tuple[Gaussians, str]
+"""The Gaussians, and how they came about."""
+
+
+def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int) -> Made:
+    """The Gaussians a run starts from, and one line that says which method made them and why.
+
+    "auto" tries what `_worth_trying` lists. The same scene, config and seed give the same bits. Raises UsageError when
+    the method asked for does not fit the scene.
+    """
+    check.at_least("--init-count", config.count, 1, "Drop the flag for the default.")
+    check.within("sh_degree", sh_degree, 0, 3, "Bands 0 to 3 are supported.")
+    generator = torch.Generator().manual_seed(seed)
+    asked = config.method != "auto"
+    known = 0 if scene.points is None else len(scene.points.xyz)
+    reason = (
+        f"the scene has {known or 'no'} points and {'every view has' if scene.has_alpha else 'its views have no'} alpha"
+    )
+    why = "as asked" if asked else "because {}"
+    for method in _worth_trying(scene, known, config):
+        made = METHODS[method](scene, config.count, sh_degree, generator)
+        if made is not None:
+            return made[0], f"{made[1]}, {why.format(reason)}"
+        if asked:
+            raise UsageError(MISFITS[method])
+        reason += WITHOUT_SUCCESS[method]
+    xyz, rgb = _random_points(scene, config.count, generator)
+    return gaussians_at(xyz, rgb, sh_degree), f"{len(xyz):,} random points where the cameras look, {why.format(reason)}"
+
+
+def _worth_trying(scene: Scene, known: int, config: InitConfig) -> list[str]:
+    """Methods before random points, best first: of few photos that show all of a scene those places on which they
+    agree, unless the scene has as many points; else its points; the visual hull of what is masked."""
+    if config.method != "auto":
+        return [config.method] if config.method in METHODS else []
+    few = len(scene.train) <= FEW_PHOTOS
+    wanted = [
+        ("stereo", few and not scene.has_alpha and known < config.count),
+        ("points", known >= ENOUGH_POINTS),
+        ("hull", scene.has_alpha),
+        ("stereo", few and scene.has_alpha),  # alpha that hides nothing
+    ]
+    return [method for method, worth in wanted if worth]
+
+
+def _from_points(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+    points = scene.points
+    if points is None or len(points.xyz) == 0:
+        return None
+    gaussians = gaussians_at(points.xyz, points.rgb.float() / 255, sh_degree)
+    return gaussians, f"{len(gaussians):,} points that came with the scene"
+
+
+def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+    found = hull_points(scene, count, generator) if scene.has_alpha else None
+    if found is None:
+        return None
+    gaussians = gaussians_at(found.xyz, found.rgb, sh_degree)
+    return (
+        gaussians,
+        f"visual hull of {found.silhouettes} silhouettes, {len(gaussians):,} points, voxel {found.voxel:.3g}",
+    )
+
+
+def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+    found = stereo_points(scene, count, generator)
+    if found.share < ENOUGH_AGREED:
+        return None
+    # Something must start where only one photo looks, or none agree.
+    xyz, rgb = _random_points(scene, count, generator)
+    gaussians = gaussians_at(torch.cat([found.xyz, xyz]), torch.cat([found.rgb, rgb]), sh_degree)
+    agreed = f"{found.photos} photos agree on {found.share:.0%} of their pixels"
+    return gaussians, f"{len(found.xyz):,} points by stereo ({agreed}) and {len(xyz):,} at random"
+
+
+def _random_points(
+    scene: Scene, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Places and colours (0..1)."""
+    cameras = [view.camera for view in scene.train]
+    focus = find_focus(cameras, scene.extent)
+    xyz = random_points(cameras, focus, count, not scene.has_alpha, generator)
+    if scene.has_alpha:
+        # Most points lie beside the object: in its colours they stay there as fog (lego, 8 views: -11 dB).
+        return xyz, torch.full((len(xyz), 3), 0.5)
+    return xyz, mean_colors(small_photos(scene.train, _COLOR_PHOTOS), xyz)
+
+
+METHODS: dict[str, Callable[[Scene, int, int, torch.Generator], Made | None]] = {
+    "points": _from_points,
+    "hull": _from_hull,
+    "stereo": _from_stereo,
+}
+"""Of a scene, how many, the highest SH band and a generator; None where a method does not fit the scene."""
+MISFITS = {
+    "points": "`--init points` needs a scene with points; it has none. Take `auto` instead.",
+    "hull": "`--init hull` needs alpha or masks that outline one object in every input view; these do not agree on "
+    "any. Check the masks, or take `--init random`.",
+    "stereo": "`--init stereo` needs photos that overlap; too few of these show the same. Add photos between them, "
+    "check the poses, or take `--init random`.",
+}
+WITHOUT_SUCCESS = {"hull": ", and its silhouettes enclose nothing", "stereo": ", and its photos agree on nothing"}

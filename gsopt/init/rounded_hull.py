@@ -1,0 +1,92 @@
+"""A visual hull without the corners that no silhouette asks for.
+
+The hull is the largest of all shapes with the given silhouettes (Franco, Lapierre & Boyer 2006); beside the object,
+where the cones of two views cross, it keeps wedges of matter that is not there. Few things have such edges. So every
+pixel of a silhouette is explained by the thickest matter behind it: with T(x) the radius of the largest ball in the
+hull that holds voxel x (local thickness, Hildebrand & Rüegsegger 1997),
+
+    (1)  keep x where  T(x) >= min over views v of  max T(y) over the voxels y in the pixel of x in v.
+
+An edge is thin and lies before or behind something thick in all views; a leg or a handle that stands out in one view is
+the thickest in its pixels there and stays. Every silhouette remains filled. What hides before thicker parts in all
+views is lost, and of an egg the middle of its sides: training puts it back. It adds matter far more readily than it
+takes matter away (docs/decisions/0001-schedule.md has the figures).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int16
+from torch import Tensor
+
+from gsopt.geometry.projection import inside, project
+from gsopt.init.thumbnails import Photo
+
+ROUNDS = 2
+"""What remains is measured again: without the tips their stumps are thin."""
+RATIO = 1.1
+"""Between two radii that are told apart."""
+FAR = 1 << 13
+"""Squared distance beyond everything, cells; twice that still fits 16 bits."""
+
+
+def rounded(
+    cells: Bool[Tensor, "X Y Z"], centers: Float[Tensor, "M 3"], voxel: float, photos: list[Photo]
+) -> Bool[Tensor, "X Y Z"]:
+    """The voxels that (1) keeps; `centers` are those of the true ones, in scene units as their edge `voxel`."""
+    for _ in range(ROUNDS):
+        thick = thickness(cells)[cells]
+        wanted = torch.full_like(thick, math.inf)
+        for photo in photos:
+            wanted = torch.minimum(wanted, thickest(photo, centers, voxel, thick))
+        stays = (thick >= wanted) | wanted.isinf()
+        cells = cells.masked_scatter(cells, stays)
+        centers = centers[stays]
+    return cells
+
+
+def thickest(photo: Photo, points: Float[Tensor, "M 3"], voxel: float, thick: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
+    """For every point the largest thickness in its pixel (as wide as a voxel at the middle depth); infinite where the
+    photo does not show it."""
+    column, row, depth = project(photo.camera, points)
+    shown = inside(photo.camera, column, row, depth)
+    found = torch.full_like(thick, math.inf)
+    if not bool(shown.any()):
+        return found
+    step = max(1, math.ceil(voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth[shown].median())))
+    width, height = math.ceil(photo.camera.width / step), math.ceil(photo.camera.height / step)
+    # A point on the far border counts as shown, by the last pixel.
+    x, y = ((column[shown] / step).long().clamp(max=width - 1), (row[shown] / step).long().clamp(max=height - 1))
+    pixel = y * width + x
+    most = torch.zeros(width * height).scatter_reduce(0, pixel, thick[shown], "amax")
+    found[shown] = most[pixel]
+    return found
+
+
+def thickness(cells: Bool[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"]:
+    """Per true cell the radius of the largest ball of true cells that holds it, in cells, in steps of RATIO down from
+    the largest of all; 0 elsewhere."""
+    solid = torch.nn.functional.pad(cells, (1,) * 6)
+    depth = squared_distance(~solid, max(solid.shape))
+    largest = math.sqrt(int(depth.max()))
+    thick = torch.zeros(solid.shape)
+    for level in reversed(range(1 + int(math.log(max(1.0, largest), RATIO)))):
+        radius = largest / RATIO**level
+        thick[squared_distance(depth >= radius**2, math.ceil(radius)) <= radius**2] = radius
+    return (thick * solid)[1:-1, 1:-1, 1:-1]
+
+
+def squared_distance(cells: Bool[Tensor, "X Y Z"], reach: int) -> Int16[Tensor, "X Y Z"]:
+    """To the nearest true cell, exact within `reach` cells along each axis, FAR beyond: one axis after the other
+    (Felzenszwalb & Huttenlocher 2012)."""
+    found = torch.where(cells, 0, FAR).to(torch.int16)
+    for axis in range(3):
+        size, nearest = found.shape[axis], found.clone()
+        for offset in range(1, min(reach, size - 1, math.isqrt(FAR)) + 1):
+            for behind, ahead in ((0, offset), (offset, 0)):
+                there = nearest.narrow(axis, ahead, size - offset)
+                torch.minimum(there, found.narrow(axis, behind, size - offset) + offset**2, out=there)
+        found = nearest.clamp_(max=FAR)
+    return found

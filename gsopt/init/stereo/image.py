@@ -1,0 +1,60 @@
+"""A photo at the size that is matched, and where its pixels lie in the world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.geometry.cameras import Cameras
+from gsopt.init.thumbnails import Photo
+
+LUMA = (0.299, 0.587, 0.114)
+"""Rec. 601."""
+_MULTIPLE = 8
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photo whose width is a multiple of 8, as the matching kernel wants it."""
+
+    camera: Cameras
+    rgb: Float[Tensor, "3 H W"]
+    """0..1."""
+
+    @staticmethod
+    def of(photo: Photo, pixels: int) -> Picture:
+        """The photo with about so many pixels, no more than it has."""
+        shrink = math.sqrt(min(1.0, pixels / (photo.camera.width * photo.camera.height)))
+        width = max(_MULTIPLE, round(photo.camera.width * shrink / _MULTIPLE) * _MULTIPLE)
+        height = max(_MULTIPLE, round(photo.camera.height * shrink))
+        rgb = torch.nn.functional.interpolate(photo.planes[None, :3].float() / 255, (height, width), mode="area")[0]
+        return Picture(photo.camera.resized(width, height), rgb)
+
+    @cached_property
+    def gray(self) -> Float[Tensor, "H W"]:
+        red, green, blue = self.rgb
+        return LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+
+    @cached_property
+    def pixels(self) -> Float[Tensor, "2 H W"]:
+        """Column and row of the pixels' centres."""
+        rows, columns = torch.arange(self.camera.height) + 0.5, torch.arange(self.camera.width) + 0.5
+        return torch.stack([columns.expand(len(rows), -1), rows[:, None].expand(-1, len(columns))])
+
+    @cached_property
+    def rays(self) -> Float[Tensor, "2 H W"]:
+        """x and y of the point at depth 1 that each pixel shows, in the camera's coordinates."""
+        K = self.camera.Ks[0]
+        column, row = self.pixels
+        return torch.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]])
+
+    def points(self, inverse_depths: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+        """In the world; written out by coordinate, so that no matrix product's blocking decides the last bit."""
+        R, center = self.camera.viewmats[0, :3, :3], self.camera.centers[0]
+        x, y = self.rays
+        return torch.stack([(x * R[0, k] + y * R[1, k] + R[2, k]) / inverse_depths + center[k] for k in range(3)], -1)

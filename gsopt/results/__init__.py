@@ -1,0 +1,1 @@
+"""Everything after the last step: evaluation, report, viewer, renders and videos."""

@@ -1,0 +1,191 @@
+"""How good a run is on views it never saw: metrics.json and the held-out renders."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gsopt import __version__
+from gsopt.data.refined_poses import with_refined_poses
+from gsopt.data.scene import Scene, View, load_scene
+from gsopt.errors import InputError
+from gsopt.events import LARGEST_METRICS, to_json, write_atomic
+from gsopt.gaussians import Gaussians
+from gsopt.metrics import VGG_NOTE, Lpips, find_vgg_weights, psnr, ssim
+from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
+from gsopt.results.video import safe_name, save_stills
+
+PSNR_CAP = 100.0
+"""dB; stands for the infinite PSNR of two equal images, which JSON cannot hold."""
+TRAIN_SAMPLE = 16
+"""With nothing held out, this many evenly spread input views are looked at."""
+DIGITS = 6
+"""Rounds off what depends on the number of torch's threads."""
+
+NO_TEST_VIEWS = (
+    "This run held out no views, so nothing can be said about new ones: metrics of training views are not reported as "
+    "held-out. They stand under `train`. Train with --eval to hold out every 8th image."
+)
+
+OnView = Callable[[int, int], None]
+
+
+def evaluate_views(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    backend: Backend,
+    settings: RasterSettings,
+    background: Float[Tensor, "3"],
+    save_dir: Path | None,
+    *,
+    vgg: bool = True,
+    on_view: OnView | None = None,
+) -> dict[str, Any]:
+    """`{"mean": {psnr, ssim, lpips_alex, lpips_vgg}, "per_view": [{name, ..., render}]}`; each mean is over views.
+
+    Renders and truths are rounded to 8 bit first. A value that cannot be had (no VGG weights, image too small for the
+    network) is None, and so is its mean. `render` is the PNG's name in `save_dir`. `on_view(done, total)` follows.
+    """
+    networks = _networks(vgg)
+    per_view: list[dict[str, Any]] = []
+    for index, view in enumerate(views):
+        picture = draw(gaussians, view.camera, backend, settings, background)
+        row: dict[str, Any] = {"name": view.name, **_judge(picture, truth(view, background), networks)}
+        if save_dir is not None:
+            (path,) = save_stills(save_dir, [(safe_name(index, view.name), picture)], overwrite=True)
+            row["render"] = path.name
+        per_view.append(row)
+        if on_view is not None:
+            on_view(len(per_view), len(views))
+    return {"mean": _mean(per_view), "per_view": per_view}
+
+
+def _networks(vgg: bool) -> dict[str, Lpips | None]:
+    has_vgg = vgg and find_vgg_weights() is not None
+    return {"lpips_alex": Lpips("alex"), "lpips_vgg": Lpips("vgg") if has_vgg else None}
+
+
+def _judge(
+    picture: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], networks: dict[str, Lpips | None]
+) -> dict[str, float | None]:
+    a, b = (image[None].float() / 255 for image in (picture, target))
+    values: dict[str, float | None] = {"psnr": min(psnr(a, b).item(), PSNR_CAP), "ssim": ssim(a, b).item()}
+    for name, network in networks.items():
+        usable = network is not None and network.fits(*picture.shape[:2])
+        values[name] = network(a, b).item() if network is not None and usable else None
+    return {name: None if value is None else round(value, DIGITS) for name, value in values.items()}
+
+
+def _mean(per_view: list[dict[str, Any]]) -> dict[str, float | None] | None:
+    """Mean of each metric over views; None for one that some view lacks, and None as a whole without views."""
+    if not per_view:
+        return None
+    columns = {key: [row[key] for row in per_view] for key in ("psnr", "ssim", "lpips_alex", "lpips_vgg")}
+    return {
+        key: None if any(value is None for value in column) else round(sum(column) / len(column), DIGITS)
+        for key, column in columns.items()
+    }
+
+
+@torch.no_grad()
+def evaluate(
+    run: Path,
+    *,
+    backend: str | None = None,
+    threads: int | None = None,
+    vgg: bool = True,
+    scene: Scene | None = None,
+    on_view: OnView | None = None,
+) -> dict[str, Any]:
+    """Judge a finished run by its held-out views and write metrics.json; other fields in there are kept.
+
+    `scene` saves loading it again. With nothing held out `mean` is null, `reason` says why, and some input views are
+    judged under `train`, where the run put them if it refined poses. Renders go to RUN/renders/{test,train}. Raises
+    InputError when run or data cannot be read.
+    """
+    finished = open_run(Path(run), backend, threads)
+    kept = read_metrics(finished.path)  # before the work: a broken file is not to be replaced
+    scene = with_refined_poses(scene or load_scene(finished.config.data), finished.path)
+    results = _results(finished, scene, vgg, on_view)
+    document = {**kept, **_about(finished), **results, "protocol": _protocol(finished, scene, results)}
+    write_atomic(finished.path / "metrics.json", to_json(document))
+    return document
+
+
+def read_metrics(run: Path) -> dict[str, Any]:
+    """What metrics.json holds, {} when there is none; InputError when it cannot be understood."""
+    path = run / "metrics.json"
+    if not path.exists():
+        return {}
+    try:
+        with open(path, "rb") as file:
+            document = json.loads(file.read(LARGEST_METRICS))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"Cannot read {path}: {error}. Move it away and evaluate again.") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path} must hold an object, got {type(document).__name__}. Move it away and evaluate again.")
+    return document
+
+
+def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | None) -> dict[str, Any]:
+    split, views = ("test", scene.test) if scene.test else ("train", _spread(scene.train, TRAIN_SAMPLE))
+    judged = evaluate_views(
+        finished.gaussians,
+        views,
+        finished.backend,
+        finished.settings,
+        finished.background,
+        finished.path / "renders" / split,
+        vgg=vgg,
+        on_view=on_view,
+    )
+    for row in judged["per_view"]:
+        row["render"] = f"renders/{split}/{row['render']}"
+    notes = [VGG_NOTE] if vgg and find_vgg_weights() is None else []
+    if split == "test":
+        return {**judged, "reason": None, "train": None, "notes": notes}
+    return {"mean": None, "per_view": [], "reason": NO_TEST_VIEWS, "train": judged, "notes": notes}
+
+
+def _spread(views: Sequence[View], count: int) -> list[View]:
+    """At most `count` of the views, evenly spread over their order."""
+    count = min(count, len(views))
+    return [views[i * len(views) // count] for i in range(count)]
+
+
+def _about(finished: FinishedRun) -> dict[str, Any]:
+    """What the figures belong to."""
+    recorded = json.loads((finished.path / "config.json").read_bytes())
+    about = {
+        "n_gaussians": len(finished.gaussians),
+        "seed": finished.config.seed,
+        "config": finished.config.to_dict(),
+    }
+    return {**about, **({"versions": recorded["versions"]} if "versions" in recorded else {})}
+
+
+def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> str:
+    """How the figures came about, in words that can stand under a table."""
+    judged = len(results["per_view"]) or len(results["train"]["per_view"])
+    background = {"random": "white (trained on random)"}.get(finished.config.data.background)
+    return (
+        "PSNR per image then mean; SSIM 11x11 sigma 1.5 zero padding; LPIPS v0.1 Alex and VGG, inputs mapped to [-1,1] "
+        "(the Inria code feeds VGG [0,1] unscaled, which gives other values); renders and truths rounded to 8 bit as "
+        f"the field does; equal images count as {PSNR_CAP:g} dB; background "
+        f"{background or finished.config.data.background}; split: learned from {len(scene.train)} views, held out "
+        f"{len(scene.test)}, judged {judged} {'held-out' if scene.test else 'training'} views; images "
+        f"{_sizes(scene.test or scene.train)}; gsopt {__version__}, torch {torch.__version__}, "
+        f"backend {finished.backend.name}."
+    )
+
+
+def _sizes(views: Sequence[View]) -> str:
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    return ", ".join(f"{width}x{height}" for width, height in sizes[:3]) + (" and others" if len(sizes) > 3 else "")

@@ -1,0 +1,145 @@
+"""A finished run, drawn again: cameras in, 8-bit pictures out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gsopt.config.train import TrainConfig
+from gsopt.data.refined_poses import with_refined_poses
+from gsopt.data.resample import premultiply
+from gsopt.data.scene import Scene, View, load_scene
+from gsopt.errors import InputError
+from gsopt.formats import load_splats
+from gsopt.gaussians import Gaussians
+from gsopt.geometry.camera_paths import ellipse_path, interpolated_path, orbit_path, turntable_path
+from gsopt.geometry.cameras import Cameras
+from gsopt.raster.api import make_backend
+from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.results.video import safe_name, save_film, save_stills
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
+"""What a render is put on; a run that trained on random backgrounds is judged on white."""
+
+Shot = tuple[str, Cameras]
+"""A file name without suffix, and the one camera to draw it from."""
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What a run directory holds, ready to be drawn."""
+
+    path: Path
+    config: TrainConfig
+    gaussians: Gaussians
+    backend: Backend
+    settings: RasterSettings
+    background: Float[Tensor, "3"]
+
+    def draw(self, camera: Cameras) -> UInt8[Tensor, "H W 3"]:
+        """One camera's picture on the run's background."""
+        return draw(self.gaussians, camera, self.backend, self.settings, self.background)
+
+
+def open_run(run: Path, backend: str | None = None, threads: int | None = None) -> FinishedRun:
+    """Read config.json and splat.ply. `backend` and `threads` replace those of the configuration.
+
+    Raises InputError when the folder is no run, or the run has not finished.
+    """
+    if not run.is_dir():
+        raise InputError(f"{run} is not a folder. Give the run directory that `gsopt train` wrote.")
+    config = TrainConfig.read(run / "config.json")
+    if not (run / "splat.ply").is_file():
+        raise InputError(
+            f"{run} has no splat.ply: the run has not finished. Wait for it, or continue it with --resume."
+        )
+    gaussians = load_splats(run / "splat.ply")
+    return FinishedRun(
+        path=run,
+        config=config,
+        gaussians=gaussians,
+        backend=make_backend(backend or config.backend, config.threads if threads is None else threads),
+        settings=RasterSettings(sh_degree=gaussians.sh_degree, antialiased=config.antialiased),
+        background=torch.tensor(BACKGROUNDS[config.data.background]),
+    )
+
+
+def draw(
+    gaussians: Gaussians, camera: Cameras, backend: Backend, settings: RasterSettings, background: Float[Tensor, "3"]
+) -> UInt8[Tensor, "H W 3"]:
+    """One camera's picture, clamped to 0..1 and rounded to 8 bit."""
+    camera = camera.to(gaussians.means.dtype)
+    return to_bytes(backend.forward(gaussians, camera, settings, background.to(gaussians.means)).colors)
+
+
+def truth(view: View, background: Float[Tensor, "3"]) -> UInt8[Tensor, "H W 3"]:
+    """The view's own pixels on the background, rounded to 8 bit."""
+    pixels = view.pixels()
+    if pixels.shape[2] == 3:
+        return pixels
+    planes = premultiply(pixels) / 255
+    return to_bytes(torch.addcmul(planes[:3].permute(1, 2, 0), 1 - planes[3][..., None], background))
+
+
+def to_bytes(colors: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+    return (colors.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def shots_along(run: FinishedRun, path: str, count: int, longest: int | None = None) -> list[Shot]:
+    """What to draw for `--path`: the input or held-out views themselves, or `count` cameras on a film's path.
+
+    `longest`: scale so that the longer side has this many px. Raises InputError when nothing was held out.
+    """
+    scene = with_refined_poses(load_scene(run.config.data), run.path)
+    if path in ("train", "test"):
+        views = scene.train if path == "train" else scene.test
+        if not views:
+            raise InputError(
+                f"{run.path} held out no views to draw, got 0. Choose another --path, or train with --eval."
+            )
+        shots = [(safe_name(index, view.name), view.camera) for index, view in enumerate(views)]
+    else:
+        cameras = Cameras.cat([view.camera.resized(*_first_size(scene)) for view in scene.train])
+        film = film_path(run, cameras, path, count)
+        shots = [(f"{index:04d}", film[index]) for index in range(len(film))]
+    return [(name, camera if longest is None else fitted(camera, longest)) for name, camera in shots]
+
+
+def film_path(run: FinishedRun, cameras: Cameras, path: str, count: int) -> Cameras:
+    """`count` cameras on an orbit, a turntable, an ellipse or through the given cameras (interpolated)."""
+    if path == "interpolated":
+        return interpolated_path(cameras, count)
+    make = {"orbit": orbit_path, "turntable": turntable_path, "ellipse": ellipse_path}[path]
+    return make(cameras, count, subject(run.gaussians, cameras))
+
+
+def subject(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"] | None:
+    """Where a film should look when the cameras do not say: for one camera, the median of the more opaque half."""
+    if len(cameras) > 1 or len(gaussians) == 0:
+        return None
+    solid = gaussians.means[gaussians.opacities >= gaussians.opacities.median()]
+    return solid.median(dim=0).values
+
+
+def fitted(camera: Cameras, longest: int) -> Cameras:
+    """The same camera with its longer side scaled to `longest` px."""
+    scale = longest / max(camera.width, camera.height)
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def render_stills(run: FinishedRun, shots: list[Shot], folder: Path, *, overwrite: bool = False) -> None:
+    """PNG frames in a folder."""
+    save_stills(folder, ((name, run.draw(camera)) for name, camera in shots), overwrite=overwrite)
+
+
+def render_film(run: FinishedRun, shots: list[Shot], output: Path, fps: float, *, overwrite: bool = False) -> None:
+    """A film; its format is the suffix of `output`."""
+    save_film(output, (run.draw(camera) for _, camera in shots), fps, overwrite=overwrite)
+
+
+def _first_size(scene: Scene) -> tuple[int, int]:
+    return scene.train[0].camera.width, scene.train[0].camera.height

@@ -1,0 +1,98 @@
+"""One self-contained page that shows sets of prompts side by side: figures, words, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+
+from PIL import Image
+
+from gsopt import __version__
+from gsopt.results.report.page import POLICY
+from gsopt.results.report.pictures import data_uri
+
+NOTHING = "\N{EN DASH}"
+CLEAR = 0.05
+"""dB by which a set of prompts has to lead to be called the best."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One set of prompts. Strings are as found: the page escapes them."""
+
+    name: str
+    prompts: tuple[tuple[str, str], ...]
+    """(source, view, polarity in a few words; text)."""
+    psnrs: tuple[float, ...]
+    """Per left-out view, dB."""
+    alignment: float | None
+    pictures: tuple[Image.Image, ...]
+
+    @property
+    def mean(self) -> float:
+        return sum(self.psnrs) / len(self.psnrs)
+
+
+def comparison_page(
+    title: str, facts: str, views: Sequence[str], truths: Sequence[Image.Image], columns: Sequence[Column]
+) -> str:
+    """The whole document. Differences are to the first column."""
+    style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
+        f"<title>{escape(title)} · gsopt prompts</title><style>\n{style}</style></head>\n<body><main>\n"
+        f'<header><p class="eyebrow">gsopt prompts compare</p><h1>{escape(title)}</h1>'
+        f'<p class="muted">{escape(facts)}</p></header>\n'
+        f"{_table(views, columns)}{_pictures(views, truths, columns)}{_words(columns)}</main>\n"
+        f"<footer><p>gsopt {escape(__version__)}. Short runs on small images: they rank prompts, they do not measure "
+        "the final quality. Differences of a few tenths of a dB may be chance.</p></footer></body></html>\n"
+    )
+
+
+def _table(views: Sequence[str], columns: Sequence[Column]) -> str:
+    means = sorted((column.mean for column in columns), reverse=True)
+    best = means[0] if len(means) == 1 or means[0] - means[1] >= CLEAR else math.inf
+    head = "".join(f"<th>{escape(view)}</th>" for view in (f"to {columns[0].name}", *views))
+    rows = []
+    for column in columns:
+        badge = ' <span class="badge best">best</span>' if column.mean == best else ""
+        figures = "".join(f"<td>{value:.2f}</td>" for value in column.psnrs)
+        aligned = NOTHING if column.alignment is None else f"{column.alignment:.3f}"
+        rows.append(
+            f"<tr><th>{escape(column.name)}{badge}</th><td>{column.mean:.2f}</td>"
+            f"<td>{column.mean - columns[0].mean:+.2f}</td>{figures}<td>{aligned}</td></tr>"
+        )
+    return (
+        '<section><h2>PSNR of views that were left out <span class="muted">dB, higher is better</span></h2>'
+        f'<div class="scroll"><table><thead><tr><th>prompts</th><th>mean</th>{head}'
+        f"<th>CLIP alignment</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div></section>\n"
+    )
+
+
+def _pictures(views: Sequence[str], truths: Sequence[Image.Image], columns: Sequence[Column]) -> str:
+    rows = []
+    for number, view in enumerate(views):
+        shown = [("photo", truths[number])]
+        shown += [(f"{column.name} · {column.psnrs[number]:.2f} dB", column.pictures[number]) for column in columns]
+        figures = "".join(
+            f'<figure><img src="{data_uri(image)}" alt=""><figcaption>{escape(name)}</figcaption></figure>'
+            for name, image in shown
+        )
+        rows.append(f'<div class="card"><p>{escape(view)}, left out</p><div class="strip">{figures}</div></div>')
+    return f"<section><h2>Side by side</h2>{''.join(rows)}</section>\n"
+
+
+def _words(columns: Sequence[Column]) -> str:
+    lists = []
+    for column in columns:
+        if not column.prompts:
+            continue
+        rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(text)}</td></tr>" for what, text in column.prompts)
+        table = f'<table class="settings"><tbody>{rows}</tbody></table>'
+        lists.append(f"<details open><summary>{escape(column.name)}</summary>{table}</details>")
+    return f"<section><h2>Words</h2>{''.join(lists)}</section>\n"

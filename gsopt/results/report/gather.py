@@ -1,0 +1,214 @@
+"""What a report shows, read from a run directory that nobody vouches for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+
+from gsopt.config.train import LARGEST, TrainConfig
+from gsopt.data.scene import Scene, View, load_scene
+from gsopt.errors import GsoptError
+from gsopt.events import LARGEST_METRICS, read_events
+from gsopt.geometry.cameras import Cameras
+from gsopt.results.finished_run import FinishedRun, film_path, fitted, open_run, truth
+from gsopt.results.report import guided, posed
+from gsopt.results.report.pictures import shrunk
+from gsopt.results.video import as_image
+
+JUDGED_SHOWN = 12
+EXTREMES_SHOWN = 4
+INPUTS_SHOWN = 24
+TURNTABLE_FRAMES = 36
+TURNTABLE_SIDE = 400
+METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One view that the figures are about."""
+
+    name: str
+    badge: str
+    """worst, best or nothing."""
+    figures: dict[str, float | None]
+    render: Image.Image
+    truth: Image.Image
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One `progress` event."""
+
+    step: float
+    seconds: float | None
+    loss: float | None
+    psnr: float | None
+    n: float | None
+
+
+@dataclass
+class Report:
+    """Everything on the page. Strings are as found: the page escapes them."""
+
+    name: str
+    config: TrainConfig
+    recorded: dict[str, Any]
+    """config.json as a whole."""
+    metrics: dict[str, Any]
+    progress: list[Progress]
+    messages: list[str]
+    """Warnings and errors of the run, then what the report itself could not do."""
+    held_out: bool = True
+    """Whether `judged` and the figures are about views the run did not learn from."""
+    mean: dict[str, float | None] = field(default_factory=dict)
+    per_view: list[dict[str, Any]] = field(default_factory=list)
+    judged: list[Judged] = field(default_factory=list)
+    inputs: list[tuple[str, Image.Image]] = field(default_factory=list)
+    input_count: int | None = None
+    test_count: int | None = None
+    n_gaussians: int | None = None
+    steps: int | None = None
+    backend: str | None = None
+    turntable: list[Image.Image] = field(default_factory=list)
+    guidance: str = ""
+    """Finished HTML."""
+    cameras: str = ""
+    """Finished HTML."""
+
+
+@torch.no_grad()
+def gather(run: Path, config: TrainConfig) -> Report:
+    """Read and draw what is there. Each part that cannot be had leaves a message instead."""
+    messages: list[str] = []
+    events = _events(run, messages)
+    report = Report(
+        name=Path(config.data.path).name or "run",
+        config=config,
+        recorded=_read_object(run / "config.json", messages),
+        metrics=_read_object(run / "metrics.json", messages),
+        progress=progress_of(events),
+        messages=messages,
+    )
+    messages += [text for event in events if (text := _message(event)) is not None]
+    report.guidance = guided.section(run, messages)
+    report.cameras = posed.section(Path(config.data.path), run, messages)
+    _take_figures(report)
+    try:
+        scene = load_scene(config.data)
+        _take_inputs(report, scene)
+        finished = open_run(run)
+        _take_drawings(report, finished, scene)
+    except GsoptError as error:
+        messages.append(f"Some pictures are missing from this report. {error}")
+    return report
+
+
+def number(value: object) -> float | None:
+    """A finite number, or None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
+        return None
+    return float(value)
+
+
+def progress_of(events: Sequence[dict[str, Any]]) -> list[Progress]:
+    """The course of a run. Where a resumed run went back to a checkpoint, what it took back is left out."""
+    course: list[Progress] = []
+    for event in events:
+        step = number(event.get("step"))
+        if event.get("kind") != "progress" or step is None:
+            continue
+        while course and course[-1].step >= step:
+            course.pop()
+        seconds, loss, psnr, n = (number(event.get(key)) for key in ("seconds", "loss", "psnr", "n"))
+        course.append(Progress(step, seconds, loss, psnr, n))
+    return course
+
+
+def chosen(psnrs: Sequence[float]) -> list[int]:
+    """Rows to show, from worst to best: the extremes at both ends and an even choice of those between."""
+    order = sorted(range(len(psnrs)), key=lambda row: psnrs[row])
+    if len(order) <= JUDGED_SHOWN:
+        return order
+    between = order[EXTREMES_SHOWN:-EXTREMES_SHOWN]
+    count = JUDGED_SHOWN - 2 * EXTREMES_SHOWN
+    spread = [between[(2 * i + 1) * len(between) // (2 * count)] for i in range(count)]
+    return order[:EXTREMES_SHOWN] + spread + order[-EXTREMES_SHOWN:]
+
+
+def _events(run: Path, messages: list[str]) -> list[dict[str, Any]]:
+    try:
+        return read_events(run / "events.jsonl")[0]
+    except (GsoptError, OSError) as error:
+        messages.append(f"The course of the run cannot be shown. {error}")
+        return []
+
+
+def _message(event: dict[str, Any]) -> str | None:
+    if event.get("kind") not in ("warning", "error"):
+        return None
+    prefix = "The run ended with an error: " if event["kind"] == "error" else ""
+    return prefix + str(event.get("message", ""))
+
+
+def _read_object(path: Path, messages: list[str]) -> dict[str, Any]:
+    if not path.exists():
+        return {}
+    try:
+        with open(path, "rb") as file:
+            document = json.loads(file.read(LARGEST_METRICS))
+    except (OSError, ValueError, RecursionError) as error:
+        messages.append(f"{path.name} cannot be read: {error}.")
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _take_figures(report: Report) -> None:
+    """Means and rows of the held-out views; where there are none, of the training views, marked as such."""
+    source = report.metrics
+    if not isinstance(source.get("mean"), dict) and isinstance(source.get("train"), dict):
+        source, report.held_out = source["train"], False
+    mean, rows = source.get("mean"), source.get("per_view")
+    report.mean = {key: number(mean.get(key)) for key in METRICS} if isinstance(mean, dict) else {}
+    report.per_view = [
+        {"name": str(row.get("name")), **{key: number(row.get(key)) for key in METRICS}}
+        for row in (rows if isinstance(rows, list) else [])
+        if isinstance(row, dict)
+    ]
+    count = number(report.metrics.get("n_gaussians"))
+    report.n_gaussians = None if count is None else int(count)
+    steps = number(report.metrics.get("steps"))
+    report.steps = None if steps is None else int(steps)
+
+
+def _take_inputs(report: Report, scene: Scene) -> None:
+    background = torch.ones(3)
+    shown = min(INPUTS_SHOWN, len(scene.train))
+    views = [scene.train[i * len(scene.train) // shown] for i in range(shown)]
+    report.inputs = [(view.name, shrunk(as_image(truth(view, background)), 200)) for view in views]
+    report.input_count, report.test_count = len(scene.train), len(scene.test)
+
+
+def _take_drawings(report: Report, finished: FinishedRun, scene: Scene) -> None:
+    report.n_gaussians, report.backend = len(finished.gaussians), finished.backend.name
+    views = {view.name: view for view in (scene.test if report.held_out else scene.train)}
+    rows = [row for row in report.per_view if row["name"] in views and row["psnr"] is not None]
+    order = chosen([row["psnr"] for row in rows])
+    for place, index in enumerate(order):
+        badge = {0: "worst", len(order) - 1: "best"}.get(place, "") if len(order) > 1 else ""
+        report.judged.append(_judged(finished, views[rows[index]["name"]], rows[index], badge))
+    size = scene.train[0].camera
+    cameras = Cameras.cat([view.camera.resized(size.width, size.height) for view in scene.train])
+    film = film_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
+    side = min(TURNTABLE_SIDE, 2 * max(size.width, size.height))
+    report.turntable = [as_image(finished.draw(fitted(film[i], side))) for i in range(len(film))]
+
+
+def _judged(finished: FinishedRun, view: View, row: dict[str, Any], badge: str) -> Judged:
+    picture, target = as_image(finished.draw(view.camera)), as_image(truth(view, finished.background))
+    return Judged(view.name, badge, {key: row[key] for key in METRICS}, picture, target)

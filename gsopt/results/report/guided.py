@@ -1,0 +1,110 @@
+"""The part of a report that tells about guidance: what it was asked, how often it acted, and what it changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from gsopt.data.files import is_regular, read_json
+from gsopt.errors import InputError
+from gsopt.results.report.pictures import data_uri, read_picture
+
+SIDE = 256
+MOST = 8
+"""Rows of pictures that are read of each kind."""
+LARGEST = 2048 * 2048
+BEFORE_AFTER = ("before", "before_uncertainty", "after", "after_uncertainty")
+PROPOSAL = ("render", "proposal", "uncertainty")
+
+Row = tuple[str, list[Image.Image | None]]
+"""A line of text and the pictures above it."""
+
+
+def section(run: Path, messages: list[str]) -> str:
+    """Empty for a run without guidance. What cannot be read is left out and said in `messages`."""
+    folder = run / "guidance"
+    if not is_regular(folder / "summary.json"):
+        return ""
+    try:
+        told = read_json(folder / "summary.json")
+    except InputError as error:
+        messages.append(f"What guidance did cannot be shown. {error}")
+        return ""
+    views = [_view(folder, view) for view in _numbers(told.get("views"))]
+    steps = [_step(folder, sample) for sample in _objects(told.get("samples"))]
+    return (
+        f"<section><h2>Guidance</h2><p>{escape(counts(told))}</p>"
+        + _cards("Least known views before the first guided step and at the end", BEFORE_AFTER, views)
+        + _cards("What the prior was shown, and what it proposed", PROPOSAL, steps)
+        + "</section>\n"
+    )
+
+
+def counts(told: dict[str, Any]) -> str:
+    """How many steps were guided, why others were not, and by what."""
+    guided, wanted, decided, failed = (_whole(told.get(key)) for key in ("guided", "wanted", "decided", "failed"))
+    guard = told.get("guard")
+    reason = guard.get("reason") if isinstance(guard, dict) else None
+    weight, factor = told.get("lambda_sds"), guard.get("factor", 1.0) if isinstance(guard, dict) else 1.0
+    if isinstance(weight, int | float) and isinstance(factor, int | float):
+        weight = f"{weight * factor:g}"
+    sentences = [
+        f"{told.get('model', 'A diffusion prior')}, policy {told.get('policy', 'unknown')}, "
+        f"lambda {'unknown' if weight is None else weight}" + (f" ({reason})." if reason else "."),
+        f"{guided} of {wanted} steps that the schedule wanted guided were guided.",
+    ]
+    if decided:
+        sentences.append(f"{decided} were left alone because the input views decide everywhere.")
+    if failed:
+        sentences.append(f"{failed} failed." + (" After that the run went on without." if told.get("ended") else ""))
+    return " ".join(sentences)
+
+
+def _view(folder: Path, view: int) -> Row:
+    files = (f"{when}_{view:02d}{what}" for when in ("before", "after") for what in ("", "_uncertainty"))
+    return "", _pictures(folder, files)
+
+
+def _step(folder: Path, sample: dict[str, Any]) -> Row:
+    step = _whole(sample.get("step"))
+    text = str(sample.get("text") or "")[:200]
+    pictures = _pictures(folder, (f"step_{step:06d}_{kind}" for kind in PROPOSAL))
+    return f"step {step:,}" + (f": {text}" if text else ""), pictures
+
+
+def _pictures(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
+    return [read_picture(folder / f"{name}.png", SIDE, LARGEST) for name in names]
+
+
+def _cards(title: str, kinds: Iterable[str], rows: list[Row]) -> str:
+    shown = [(text, pictures) for text, pictures in rows if any(pictures)]
+    if not shown:
+        return ""
+    cards = "".join(
+        '<article class="card"><div class="strip">'
+        + "".join(
+            f'<figure><img loading="lazy" src="{data_uri(picture)}" alt="{escape(kind)}">'
+            f"<figcaption>{escape(kind.replace('_', ', '))}</figcaption></figure>"
+            for kind, picture in zip(kinds, pictures, strict=True)
+            if picture is not None
+        )
+        + f'</div><p class="muted">{escape(text)}</p></article>'
+        for text, pictures in shown
+    )
+    return f'<h3>{escape(title)}</h3><div class="cards">{cards}</div>'
+
+
+def _whole(value: object) -> int:
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 10**9 else 0
+
+
+def _numbers(value: object) -> list[int]:
+    return [_whole(item) for item in value[:MOST]] if isinstance(value, list) else []
+
+
+def _objects(value: object) -> list[dict[str, Any]]:
+    return [item for item in value[:MOST] if isinstance(item, dict)] if isinstance(value, list) else []

@@ -1,0 +1,77 @@
+"""Pictures that travel inside the page: thumbnails, error maps, an animation, all as data URIs."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gsopt.data.files import is_regular
+from gsopt.results.video import write_film
+
+QUALITY = 88
+ERROR_FULL_SCALE = 0.25
+"""Mean absolute difference of the three channels (of 1) at which the color scale ends; the same for every view."""
+# Dark to bright, so that it reads in grey too: error, red, green, blue.
+ERROR_COLORS = (
+    (0.00, 13, 16, 33),
+    (0.25, 43, 76, 155),
+    (0.50, 24, 169, 153),
+    (0.75, 242, 193, 78),
+    (1.00, 255, 246, 230),
+)
+
+
+def shrunk(image: Image.Image, side: int) -> Image.Image:
+    """The image, made to fit into a square of `side` px; never enlarged."""
+    copy = image.copy()
+    copy.thumbnail((side, side), Image.Resampling.LANCZOS)
+    return copy
+
+
+def read_picture(path: Path, side: int, most_pixels: int) -> Image.Image | None:
+    """A PNG made to fit into a square of `side` px; None for a file that is missing, too large or no picture."""
+    if not is_regular(path):
+        return None
+    try:
+        with Image.open(path, formats=("PNG",)) as image:
+            return shrunk(image.convert("RGB"), side) if image.width * image.height <= most_pixels else None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+
+
+def data_uri(image: Image.Image) -> str:
+    """A WebP picture as a data URI."""
+    buffer = io.BytesIO()
+    image.save(buffer, format="WEBP", quality=QUALITY, method=4)
+    return _uri(buffer.getvalue())
+
+
+def film_uri(images: Sequence[Image.Image], fps: float) -> str:
+    """An endless animated WebP as a data URI."""
+    buffer = io.BytesIO()
+    write_film(buffer, iter(images), ".webp", fps)
+    return _uri(buffer.getvalue())
+
+
+def error_map(render: Image.Image, truth: Image.Image) -> Image.Image:
+    """Mean absolute difference over the channels, colored from 0 to ERROR_FULL_SCALE and more."""
+    a, b = (np.asarray(image, dtype=np.float64) / 255 for image in (render, truth))
+    level = np.clip(np.abs(a - b).mean(axis=2) / ERROR_FULL_SCALE, 0, 1)
+    stops = np.array(ERROR_COLORS)
+    channels = [np.interp(level, stops[:, 0], stops[:, 1 + channel]) for channel in range(3)]
+    return Image.fromarray(np.stack(channels, axis=2).round().astype(np.uint8))
+
+
+def error_gradient() -> str:
+    """The color scale as a CSS gradient."""
+    stops = ", ".join(f"rgb({red} {green} {blue}) {at:.0%}" for at, red, green, blue in ERROR_COLORS)
+    return f"linear-gradient(90deg, {stops})"
+
+
+def _uri(data: bytes) -> str:
+    return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")

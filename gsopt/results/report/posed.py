@@ -1,0 +1,59 @@
+"""The part of a report that tells where the cameras came from: what `gsopt sfm` found, and what training corrected."""
+
+from __future__ import annotations
+
+import statistics
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from gsopt.data.files import is_regular, read_json
+from gsopt.errors import InputError
+from gsopt.results.report.pictures import data_uri, read_picture
+
+SIDE = 1440
+LARGEST = 4096 * 4096
+MOST_LINES = 40
+
+
+def section(dataset: Path, run: Path, messages: list[str]) -> str:
+    """Empty where the poses were given and kept. What cannot be read is left out and said in `messages`."""
+    lines = [*_found(dataset / "sfm.json", messages), *_refined(run / "poses.json", messages)]
+    picture = read_picture(dataset / "sfm.png", SIDE, LARGEST)
+    if not lines and picture is None:
+        return ""
+    drawn = "" if picture is None else f'<img src="{data_uri(picture)}" style="width:100%" alt="Cameras and points">'
+    return f"<section><h2>Cameras</h2>{''.join(f'<p>{escape(line)}</p>' for line in lines)}{drawn}</section>\n"
+
+
+def _found(path: Path, messages: list[str]) -> list[str]:
+    """The report of `gsopt sfm` as it was printed."""
+    lines = _read(path, messages).get("report")
+    return [line.strip() for line in lines[:MOST_LINES] if isinstance(line, str)] if isinstance(lines, list) else []
+
+
+def _refined(path: Path, messages: list[str]) -> list[str]:
+    views = _read(path, messages).get("views")
+    turned = [_degrees(view) for view in views] if isinstance(views, list) else []
+    if not turned:
+        return []
+    return [
+        f"--refine-poses turned {len(turned)} input views by {statistics.median(turned):.3f} degrees (median), "
+        f"{max(turned):.3f} at most."
+    ]
+
+
+def _degrees(view: object) -> float:
+    value = view.get("turned_degrees") if isinstance(view, dict) else None
+    return float(value) if isinstance(value, int | float) and abs(value) <= 180 else 0.0
+
+
+def _read(path: Path, messages: list[str]) -> dict[str, Any]:
+    if not is_regular(path):
+        return {}
+    try:
+        document = read_json(path)
+    except InputError as error:
+        messages.append(f"Where the cameras came from cannot be shown. {error}")
+        return {}
+    return document if isinstance(document, dict) else {}

@@ -1,0 +1,1 @@
+"""Training with a prior: the run's session, the guard, the comparison of prompts."""

@@ -1,0 +1,216 @@
+"""The web viewer: what it follows, where it puts cameras, and that a real server starts."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+import torch
+from PIL import Image
+
+from gsopt import cli
+from gsopt.config.train import DataConfig, TrainConfig
+from gsopt.errors import InputError, MissingDependency
+from gsopt.events import EventWriter, to_json
+from gsopt.formats import save_splats
+from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
+from gsopt.geometry.quats import rotation_matrices
+from gsopt.results import viewer
+
+SIZE = 16
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+EYES = torch.tensor([[3.0, 0, 1], [0, 3, 1], [-3, 0, 1], [0, -3, 1]], dtype=torch.float64)
+
+
+def gaussians(n: int = 5, seed: int = 0) -> Gaussians:
+    random = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=random),
+        quats=torch.randn(n, 4, generator=random),
+        log_scales=torch.randn(n, 3, generator=random) - 2,
+        logit_opacities=torch.randn(n, generator=random),
+        sh0=torch.randn(n, 1, 3, generator=random),
+        shN=torch.zeros(n, 0, 3),
+    )
+
+
+def cameras() -> list[Cameras]:
+    viewmats = look_at(EYES, torch.zeros(3, dtype=torch.float64), UP)
+    K = intrinsics(0.8, 2 * SIZE, SIZE)
+    return [Cameras(viewmat[None], K[None], 2 * SIZE, SIZE) for viewmat in viewmats]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run directory with a config that names a dataset of four views, and no events yet."""
+    dataset, folder = tmp_path / "scene", tmp_path / "run"
+    (dataset / "train").mkdir(parents=True)
+    (folder / "previews").mkdir(parents=True)
+    frames = []
+    for i, camera in enumerate(cameras()):
+        Image.new("RGBA", (2 * SIZE, SIZE), (200, 100, 50, 255)).save(dataset / f"train/r_{i}.png")
+        pose = opengl_from_viewmats(camera.viewmats[0]).tolist()
+        frames.append({"file_path": f"./train/r_{i}", "transform_matrix": pose})
+    (dataset / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    config = TrainConfig(data=DataConfig(path=str(dataset)))
+    (folder / "config.json").write_bytes(to_json({"config": config.to_dict()}))
+    return folder
+
+
+def emit(run: Path, *events: dict[str, Any]) -> None:
+    writer = EventWriter(run)
+    for event in events:
+        writer.emit(**event)
+    writer.close()
+
+
+def preview(run: Path, step: int) -> dict[str, Any]:
+    """Write a preview with `step` Gaussians and give its event."""
+    name = f"previews/step_{step:06d}.ply"
+    save_splats(run / name, gaussians(step))
+    return {"kind": "preview", "step": step, "path": name}
+
+
+def test_a_follower_passes_over_previews_that_are_no_longer_the_newest(run: Path) -> None:
+    follower = viewer.RunFollower(run)
+    assert follower.poll() is None
+    emit(run, {"kind": "started"}, preview(run, 1), preview(run, 2), {"kind": "progress", "step": 3})
+    update = follower.poll()
+    assert update is not None
+    assert update.splats == (run / "previews/step_000002.ply").resolve()
+    assert follower.poll() is None
+
+
+@pytest.mark.parametrize("last", ["done", "stopped", "error"])
+def test_a_run_that_ended_shows_its_result(run: Path, last: str) -> None:
+    save_splats(run / "splat.ply", gaussians())
+    emit(run, preview(run, 1), {"kind": last})
+    update = viewer.RunFollower(run).poll()
+    assert update == viewer.Update((run / "splat.ply").resolve(), last)
+
+
+def test_a_run_that_ended_without_a_result_keeps_the_last_preview(run: Path) -> None:
+    emit(run, preview(run, 1), {"kind": "error"})
+    update = viewer.RunFollower(run).poll()
+    assert update == viewer.Update((run / "previews/step_000001.ply").resolve(), "error")
+
+
+@pytest.mark.parametrize("path", ["../outside.ply", "/etc/hostname", None, 7, "previews", "previews/absent.ply"])
+def test_a_path_that_leads_out_of_the_run_or_nowhere_is_ignored(run: Path, path: object) -> None:
+    save_splats(run.parent / "outside.ply", gaussians())
+    emit(run, {"kind": "preview", "step": 1, "path": path})
+    update = viewer.RunFollower(run).poll()
+    assert update is None or update.splats is None
+
+
+class Recorder:
+    """Stands in for viser: keeps what the scene was told."""
+
+    def __init__(self) -> None:
+        self.server = MagicMock()
+        self.module = SimpleNamespace(ViserServer=MagicMock(return_value=self.server))
+
+    def told(self, what: str) -> list[SimpleNamespace]:
+        calls = getattr(self.server.scene, what).call_args_list
+        return [SimpleNamespace(args=call.args, **call.kwargs) for call in calls]
+
+
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    fake = Recorder()
+    monkeypatch.setattr(viewer, "require", lambda *_: fake.module)
+    return fake
+
+
+def test_frusta_stand_and_look_as_the_cameras_do(recorder: Recorder) -> None:
+    viewer.SplatViewer("127.0.0.1", 0).show_cameras(cameras(), radius=1.0)
+    frusta = recorder.told("add_camera_frustum")
+    assert len({frustum.args[0] for frustum in frusta}) == len(EYES)
+    for frustum, eye in zip(frusta, EYES, strict=True):
+        torch.testing.assert_close(torch.from_numpy(frustum.position), eye)
+        forward = rotation_matrices(torch.from_numpy(frustum.wxyz))[:, 2]
+        torch.testing.assert_close(forward, -eye / eye.norm())
+        assert math.tan(frustum.fov / 2) * frustum.aspect == pytest.approx(math.tan(0.8 / 2))
+
+
+def test_up_is_where_the_cameras_have_it(recorder: Recorder) -> None:
+    viewer.SplatViewer("127.0.0.1", 0).show_cameras(cameras(), radius=1.0)
+    (call,) = recorder.told("set_up_direction")
+    torch.testing.assert_close(torch.tensor(call.args[0], dtype=torch.float64), UP)
+
+
+def test_up_of_cameras_that_cancel_is_still_a_direction() -> None:
+    turned = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    camera = cameras()[0]
+    upside_down = Cameras(turned @ camera.viewmats, camera.Ks, camera.width, camera.height)
+    torch.testing.assert_close(viewer.mean_up([camera, upside_down]), UP)
+
+
+def test_splats_are_sent_after_activation(recorder: Recorder) -> None:
+    model = gaussians()
+    viewer.SplatViewer("127.0.0.1", 0).show_splats(model, "caption")
+    (splats,) = recorder.told("add_gaussian_splats")
+    torch.testing.assert_close(torch.from_numpy(splats.opacities)[:, 0], model.opacities)
+    variances = torch.linalg.eigvalsh(torch.from_numpy(splats.covariances))
+    torch.testing.assert_close(variances, model.scales.square().sort(dim=1).values, rtol=1e-4, atol=1e-6)
+    assert splats.rgbs.min() >= 0
+    assert splats.rgbs.max() <= 1
+
+
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_the_extent_of_any_number_of_points_is_positive_and_moves_with_them(n: int) -> None:
+    points = gaussians(n).means
+    center, radius = viewer.extent(points)
+    moved_center, moved_radius = viewer.extent(points + 10)
+    assert radius > 0
+    assert moved_radius == pytest.approx(radius, rel=1e-4)
+    if n:
+        torch.testing.assert_close(moved_center, center + 10)
+
+
+def test_a_run_shows_each_new_preview_and_its_cameras_once(run: Path, recorder: Recorder) -> None:
+    lines = viewer.view_run(viewer.SplatViewer("127.0.0.1", 0), run)
+    assert next(lines) == ""
+    for step in (1, 2):
+        emit(run, preview(run, step))
+        assert list(itertools.islice(lines, 2)) == [f"step {step}", ""]
+    assert [len(call.centers) for call in recorder.told("add_gaussian_splats")] == [1, 2]
+    assert len(recorder.told("add_camera_frustum")) == len(EYES)
+
+
+def test_a_run_whose_photos_are_gone_is_still_shown(run: Path, recorder: Recorder) -> None:
+    (run.parent / "scene").rename(run.parent / "elsewhere")
+    emit(run, preview(run, 1))
+    lines = viewer.view_run(viewer.SplatViewer("127.0.0.1", 0), run)
+    assert "no input cameras" in next(lines)
+    assert next(lines) == "step 1"
+
+
+@pytest.mark.parametrize("target", ["absent", "empty"])
+def test_what_is_neither_a_run_nor_a_file_is_an_input_error(tmp_path: Path, target: str) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=target):
+        viewer.serve(tmp_path / target, "127.0.0.1", 0, once=True)
+
+
+def test_without_viser_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingDependency, match=r"gsopt\[viewer\]"):
+        viewer.SplatViewer("127.0.0.1", 0)
+
+
+def test_view_once_serves_a_run_and_a_file(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    emit(run, preview(run, 3), {"kind": "started"})
+    assert cli.main(["view", str(run), "--port", "0", "--once"]) == 0
+    out = capsys.readouterr().out
+    assert "http://127.0.0.1:" in out
+    assert "step 3" in out
+    assert cli.main(["view", str(run / "previews/step_000003.ply"), "--port", "0", "--once"]) == 0
