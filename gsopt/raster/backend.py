@@ -1,6 +1,6 @@
 """What a rasteriser backend must offer, and how one is chosen.
 
-A backend draws one camera at a time. `forward` returns a `Frame`, `backward` turns the gradient of a loss with
+A backend draws one camera at a time. `forward` returns a `RenderedFrame`, `backward` turns the gradient of a loss with
 respect to that frame into gradients of the parameters. The training loop calls these two directly; `rasterize`
 in `api.py` wraps the same two in autograd.
 
@@ -59,7 +59,7 @@ class RasterSettings:
 
 
 @dataclass(frozen=True)
-class Frame:
+class RenderedFrame:
     """What one camera saw. Keeps, out of sight, what `backward` needs."""
 
     colors: Float[Tensor, "H W 3"]
@@ -127,13 +127,13 @@ class Backend(Protocol):
         background: Float[Tensor, "3"] | None = None,
         *,
         depth: bool = False,
-    ) -> Frame:
+    ) -> RenderedFrame:
         """Draw one camera (len(camera) == 1)."""
         ...
 
     def backward(
         self,
-        frame: Frame,
+        frame: RenderedFrame,
         v_colors: Float[Tensor, "H W 3"],
         v_alphas: Float[Tensor, "H W"] | None = None,
         v_depths: Float[Tensor, "H W"] | None = None,

@@ -15,7 +15,7 @@ from gsopt.errors import NumericalError, UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
-from gsopt.raster.backend import AdamStep, Frame, Gradients, Photometric, RasterSettings
+from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame
 
 ISA_VARIABLE = "GSOPT_ISA"
 GRADIENTS = tuple(field.name for field in fields(Gradients))
@@ -72,7 +72,7 @@ class CpuBackend:
         background: Float[Tensor, "3"] | None = None,
         *,
         depth: bool = False,
-    ) -> Frame:
+    ) -> RenderedFrame:
         """See `Backend.forward`."""
         height, width, n = camera.height, camera.width, len(gaussians)
         gaussians = _as_float32(gaussians)
@@ -91,11 +91,11 @@ class CpuBackend:
                 f"Drawing {n:,} Gaussians at {width}x{height} needs more memory than there is: {error}. Draw fewer or "
                 "smaller splats, or a smaller image (`-r`)."
             ) from error
-        return Frame(colors, alphas, depths, radii, _Context(frame, model, gaussians))
+        return RenderedFrame(colors, alphas, depths, radii, _Context(frame, model, gaussians))
 
     def backward(
         self,
-        frame: Frame,
+        frame: RenderedFrame,
         v_colors: Float[Tensor, "H W 3"],
         v_alphas: Float[Tensor, "H W"] | None = None,
         v_depths: Float[Tensor, "H W"] | None = None,
@@ -115,7 +115,7 @@ class CpuBackend:
         self._idle.append(buffers)
         return gradients
 
-    def release(self, frame: Frame) -> None:
+    def release(self, frame: RenderedFrame) -> None:
         """Give a frame's buffers back when no `backward` will follow."""
         assert isinstance(frame.context, _Context)
         self._idle.append(frame.context.take())

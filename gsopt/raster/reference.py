@@ -27,10 +27,10 @@ from gsopt.raster.backend import (
     DET_MIN,
     TRANSMITTANCE_MIN,
     AdamStep,
-    Frame,
     Gradients,
     Photometric,
     RasterSettings,
+    RenderedFrame,
 )
 from gsopt.raster.ssim import photometric_terms
 
@@ -221,7 +221,7 @@ class ReferenceBackend:
         background: Float[Tensor, "3"] | None = None,
         *,
         depth: bool = False,
-    ) -> Frame:
+    ) -> RenderedFrame:
         """Draw one camera in the dtype of the Gaussians."""
         if len(camera) != 1:
             raise UsageError(f"A backend draws one camera at a time, got {len(camera)}. Call it once per camera.")
@@ -232,7 +232,7 @@ class ReferenceBackend:
             offsets2d = gaussians.means.new_zeros(len(gaussians), 2).requires_grad_()
             splats = splat(leaves, camera, settings, offsets2d)
             tape = Tape(leaves, offsets2d, splats, behind, *self._image(splats, behind, camera))
-        return Frame(
+        return RenderedFrame(
             colors=tape.colors.detach(),
             alphas=tape.alphas.detach(),
             depths=tape.depths.detach() if depth else None,
@@ -242,7 +242,7 @@ class ReferenceBackend:
 
     def backward(
         self,
-        frame: Frame,
+        frame: RenderedFrame,
         v_colors: Float[Tensor, "H W 3"],
         v_alphas: Float[Tensor, "H W"] | None = None,
         v_depths: Float[Tensor, "H W"] | None = None,

@@ -17,7 +17,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.metrics import psnr
 from gsopt.raster.api import expected_depth
-from gsopt.raster.backend import Backend, Frame, Gradients, RasterSettings
+from gsopt.raster.backend import Backend, Gradients, RasterSettings, RenderedFrame
 from gsopt.sds import coverage, policies, schedule
 from gsopt.sds.candidate_views import draw_candidate, make_rig, nearest, square_views
 from gsopt.sds.conditioning import Conditioning
@@ -186,7 +186,7 @@ class Guide:
 
     def _see(
         self, camera: Cameras, background: Float[Tensor, "3"], gaussians: Gaussians, settings: RasterSettings
-    ) -> tuple[Frame, Seen]:
+    ) -> tuple[RenderedFrame, Seen]:
         """A render, and what is known about it."""
         assert self.memory.coverage is not None
         frame = self.backend.forward(gaussians, camera, settings, background, depth=self.prior.aligned)

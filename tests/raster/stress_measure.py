@@ -10,7 +10,7 @@ from raster_scenes import Case, undecided_pixels, weights_like
 from tolerances import DECISION
 from torch import Tensor
 
-from gsopt.raster.backend import Backend, Frame, Gradients
+from gsopt.raster.backend import Backend, Gradients, RenderedFrame
 from gsopt.raster.reference import ReferenceBackend
 
 ORACLE = ReferenceBackend()
@@ -38,7 +38,7 @@ class Truth:
 
     case: Case
     decided: Bool[Tensor, "H W"]
-    frame: Frame
+    frame: RenderedFrame
     weights: tuple[Tensor, Tensor, Tensor]
     """v_colors, v_alphas, v_depths; zero on pixels that rounding may tip."""
     gradients: Gradients
@@ -64,7 +64,7 @@ def deviation(backend: Backend, truth: Truth) -> Deviation:
     return Deviation(image_error(frame, truth.frame, truth.decided), errors[worst], worst, undecided)
 
 
-def image_error(got: Frame, truth: Frame, decided: Tensor) -> float:
+def image_error(got: RenderedFrame, truth: RenderedFrame, decided: Tensor) -> float:
     """The largest of colors, alphas and depths."""
     assert got.depths is not None
     assert truth.depths is not None

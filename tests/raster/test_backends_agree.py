@@ -27,7 +27,7 @@ from gsopt.errors import UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster import _cpu, cpu_backend  # type: ignore[attr-defined]
 from gsopt.raster.api import make_backend
-from gsopt.raster.backend import AdamStep, Backend, Frame, Gradients, RasterSettings
+from gsopt.raster.backend import AdamStep, Backend, Gradients, RasterSettings, RenderedFrame
 from gsopt.raster.cpu_backend import ISA_VARIABLE, CpuBackend
 from gsopt.raster.reference import ReferenceBackend, extents, project
 
@@ -52,11 +52,11 @@ def single(case: Case) -> Case:
     return replace(case, gaussians=case.gaussians.to(torch.float32))
 
 
-def draw(backend: Backend, case: Case) -> Frame:
+def draw(backend: Backend, case: Case) -> RenderedFrame:
     return backend.forward(case.gaussians, case.camera, case.settings, case.background, depth=True)
 
 
-def check_images(got: Frame, expected: Frame, decided: Tensor) -> None:
+def check_images(got: RenderedFrame, expected: RenderedFrame, decided: Tensor) -> None:
     assert got.depths is not None
     assert expected.depths is not None
     assert got.colors.dtype == torch.float32

@@ -17,13 +17,13 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry import quats, sh
 from gsopt.geometry.cameras import Cameras, intrinsics
 from gsopt.raster import reference
-from gsopt.raster.backend import ALPHA_MIN, Frame, RasterSettings
+from gsopt.raster.backend import ALPHA_MIN, RasterSettings, RenderedFrame
 
 BACKEND = reference.ReferenceBackend()
 drawn = settings(max_examples=25, deadline=None, derandomize=True)
 
 
-def draw(case: Case, background: bool = True) -> Frame:
+def draw(case: Case, background: bool = True) -> RenderedFrame:
     return BACKEND.forward(
         case.gaussians, case.camera, case.settings, case.background if background else None, depth=True
     )

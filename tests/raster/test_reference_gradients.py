@@ -11,7 +11,7 @@ from tolerances import DIFFERENCE, DIFFERENCE_STEP, EXACT
 from torch import Tensor
 
 from gsopt.gaussians import PARAMETERS
-from gsopt.raster.backend import TRANSMITTANCE_MIN, AdamStep, Frame, RasterSettings
+from gsopt.raster.backend import TRANSMITTANCE_MIN, AdamStep, RasterSettings, RenderedFrame
 from gsopt.raster.reference import ReferenceBackend, project
 from gsopt.raster.ssim import WINDOW, ssim, ssim_map, window
 
@@ -32,7 +32,7 @@ CASES = {
 }
 
 
-def draw(case: Case) -> Frame:
+def draw(case: Case) -> RenderedFrame:
     return SMOOTH.forward(case.gaussians, case.camera, case.settings, case.background, depth=True)
 
 
