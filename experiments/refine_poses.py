@@ -87,15 +87,15 @@ def trained(data: Path, run: Path, flags: list[str]) -> dict[str, Any]:
 
 def pose_error(data: Path, run: Path, truth: Path) -> dict[str, Any]:
     """Of the input cameras that the run ended with, after the best similarity."""
-    from gsopt.data.scene import read_source
+    from gsopt.data.scene import read_dataset
     from gsopt.data.sfm.trajectory import compare
 
-    true = {frame.name: frame.viewmat.numpy() for frame in read_source(truth).frames}
+    true = {frame.name: frame.viewmat.numpy() for frame in read_dataset(truth).frames}
     if (run / "poses.json").is_file():
         views = json.loads((run / "poses.json").read_text())["views"]
         found = {view["name"]: np.array(view["cam_from_world"]) for view in views}
     else:
-        found = {frame.name: frame.viewmat.numpy() for frame in read_source(data).frames}
+        found = {frame.name: frame.viewmat.numpy() for frame in read_dataset(data).frames}
     names = sorted(found)
     error = compare(np.stack([found[name] for name in names]), np.stack([true[name] for name in names])).summary()
     return {name: error[name] for name in ("rotation_degrees_rms", "position_rms")}

@@ -179,9 +179,9 @@ def truths(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def all_frames(folder: Path) -> list[Any]:
-    from gsopt.data.scene import read_source
+    from gsopt.data.scene import read_dataset
 
-    source = read_source(folder)
+    source = read_dataset(folder)
     return [*source.frames, *(source.held_out or [])]
 
 

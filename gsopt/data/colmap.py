@@ -18,7 +18,7 @@ from gsopt.data import files
 from gsopt.data.colmap_files import CameraRecord, ImageRecord, read_cameras, read_images, read_points
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
-from gsopt.data.posed_images import Frame, Source, check_enough, check_pose, summarize_names
+from gsopt.data.posed_images import Dataset, PosedImage, check_enough, check_pose, summarize_names
 from gsopt.errors import InputError
 
 SUPPORTED = (
@@ -49,7 +49,7 @@ def find_model(root: Path) -> Model | None:
     return None
 
 
-def read_colmap(root: Path) -> Source:
+def read_colmap(root: Path) -> Dataset:
     """Read the reconstruction of `root`. Raises InputError."""
     model = find_model(root)
     if model is None:
@@ -66,13 +66,13 @@ def read_colmap(root: Path) -> Source:
         positions, colors = read_points(model.file("points3D"))
         finite = np.isfinite(positions).all(axis=1)
         xyz, rgb = torch.from_numpy(positions[finite]), torch.from_numpy(colors[finite])
-    return Source("colmap", frames, held_out, xyz, rgb, warnings)
+    return Dataset("colmap", frames, held_out, xyz, rgb, warnings)
 
 
 def _frames(
     root: Path, records: list[ImageRecord], cameras: dict[int, CameraRecord], path: Path, warnings: list[str]
-) -> list[Frame]:
-    frames: list[Frame] = []
+) -> list[PosedImage]:
+    frames: list[PosedImage] = []
     absent: list[str] = []
     for record in records:
         image = files.child(root / "images", record.name)
@@ -97,7 +97,7 @@ def _frames(
     return frames
 
 
-def _frame(root: Path, record: ImageRecord, camera: CameraRecord, image: Path, where: str, position: int) -> Frame:
+def _frame(root: Path, record: ImageRecord, camera: CameraRecord, image: Path, where: str, position: int) -> PosedImage:
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = _rotation(record.quat, where)
     viewmat[:3, 3] = torch.tensor(record.translation, dtype=torch.float64)
@@ -105,7 +105,7 @@ def _frame(root: Path, record: ImageRecord, camera: CameraRecord, image: Path, w
     K, lens = _camera_model(camera, where)
     name = files.relative_name(image, root)
     mask = find_mask(root / "masks", record.name) if (root / "masks").is_dir() else None
-    return Frame(name, image, mask, viewmat, K, camera.width, camera.height, lens, position)
+    return PosedImage(name, image, mask, viewmat, K, camera.width, camera.height, lens, position)
 
 
 def _rotation(quat: tuple[float, float, float, float], where: str) -> Float[Tensor, "3 3"]:
@@ -154,7 +154,7 @@ def _camera_model(camera: CameraRecord, where: str) -> tuple[Float[Tensor, "3 3"
     raise InputError(f"The {where} uses camera model {model}; read are {SUPPORTED}. Undistort it with COLMAP first.")
 
 
-def _held_out(path: Path, frames: list[Frame]) -> tuple[list[Frame] | None, list[Frame]]:
+def _held_out(path: Path, frames: list[PosedImage]) -> tuple[list[PosedImage] | None, list[PosedImage]]:
     """(test, rest) by the names in test.txt, one a line, as in images.txt; (None, all) without that file."""
     if not files.is_regular(path):
         return None, frames

@@ -32,7 +32,7 @@ _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 
 
 @dataclass(frozen=True)
-class Picture:
+class ImageSource:
     """One image file and how it becomes working pixels."""
 
     path: Path
@@ -49,8 +49,8 @@ class Picture:
 class ImageStore:
     """The images of a scene. `get` may be called from several threads; tensors are shared, so never write to one."""
 
-    def __init__(self, pictures: Sequence[Picture], cache_mb: int) -> None:
-        self.pictures = tuple(pictures)
+    def __init__(self, sources: Sequence[ImageSource], cache_mb: int) -> None:
+        self.sources = tuple(sources)
         self._budget = cache_mb * (1 << 20)
         self._used = 0
         self._cache: OrderedDict[int, Tensor] = OrderedDict()
@@ -58,7 +58,7 @@ class ImageStore:
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        return len(self.pictures)
+        return len(self.sources)
 
     @property
     def cached_bytes(self) -> int:
@@ -71,7 +71,7 @@ class ImageStore:
             if index in self._cache:
                 self._cache.move_to_end(index)
                 return self._cache[index]
-        pixels = self._load(self.pictures[index])  # outside the lock, so that threads decode side by side
+        pixels = self._load(self.sources[index])  # outside the lock, so that threads decode side by side
         with self._lock:
             self._keep(index, pixels)
         return pixels
@@ -85,18 +85,18 @@ class ImageStore:
             _, oldest = self._cache.popitem(last=False)
             self._used -= oldest.nbytes
 
-    def _load(self, picture: Picture) -> Tensor:
-        pixels = read_pixels(picture.path)
-        if (pixels.shape[1], pixels.shape[0]) != picture.stored:
-            raise size_mismatch(picture.path, (pixels.shape[1], pixels.shape[0]), picture.stored)
-        if picture.mask is not None:
-            pixels = apply_mask(pixels, read_gray(picture.mask, picture.stored), picture.mask)
-        if picture.undistortion is None and picture.stored == (picture.width, picture.height):
+    def _load(self, source: ImageSource) -> Tensor:
+        pixels = read_pixels(source.path)
+        if (pixels.shape[1], pixels.shape[0]) != source.stored:
+            raise size_mismatch(source.path, (pixels.shape[1], pixels.shape[0]), source.stored)
+        if source.mask is not None:
+            pixels = apply_mask(pixels, read_gray(source.mask, source.stored), source.mask)
+        if source.undistortion is None and source.stored == (source.width, source.height):
             return pixels
         planes = premultiply(pixels)
-        if picture.undistortion is not None:
-            planes = undistort(planes, self._sample_grid(picture.undistortion))
-        return unpremultiply(area_downscale(planes, picture.width, picture.height))
+        if source.undistortion is not None:
+            planes = undistort(planes, self._sample_grid(source.undistortion))
+        return unpremultiply(area_downscale(planes, source.width, source.height))
 
     def _sample_grid(self, undistortion: Undistortion) -> Float[Tensor, "H W 2"]:
         """The grid of one camera is kept: photos of one lens follow each other."""

@@ -18,7 +18,7 @@ RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Frame:
+class PosedImage:
     """One posed image file."""
 
     name: str
@@ -36,13 +36,13 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Source:
+class Dataset:
     """A dataset as read."""
 
     kind: str
-    frames: list[Frame]
+    frames: list[PosedImage]
     """In the order that `--view-ids` counts."""
-    held_out: list[Frame] | None
+    held_out: list[PosedImage] | None
     """Frames the dataset itself holds out; None when it says nothing."""
     xyz: Float[Tensor, "P 3"] | None = None
     rgb: UInt8[Tensor, "P 3"] | None = None
@@ -81,7 +81,7 @@ def read_pose(record: dict[str, Any], key: str, where: str) -> Float[Tensor, "4 
     return pose
 
 
-def check_enough(frames: list[Frame], absent: list[str], path: Path) -> None:
+def check_enough(frames: list[PosedImage], absent: list[str], path: Path) -> None:
     """InputError when so many of the images that `path` names are absent that no two remain."""
     if absent and len(frames) < 2:
         raise InputError(

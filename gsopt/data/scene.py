@@ -12,8 +12,8 @@ from torch import Tensor
 from gsopt.config.train import DataConfig
 from gsopt.data import files
 from gsopt.data.colmap import find_model, read_colmap
-from gsopt.data.images import ImageStore, Picture, read_header, size_mismatch
-from gsopt.data.posed_images import Frame, Source
+from gsopt.data.images import ImageSource, ImageStore, read_header, size_mismatch
+from gsopt.data.posed_images import Dataset, PosedImage
 from gsopt.data.resample import downscaled_size
 from gsopt.data.split import split
 from gsopt.data.transforms import read_transforms
@@ -105,21 +105,21 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     if not isinstance(config, DataConfig):
         config = DataConfig(path=str(config))
     root = Path(config.path).expanduser()
-    source = read_source(root)
-    if not source.frames:
+    dataset = read_dataset(root)
+    if not dataset.frames:
         raise InputError(f"{root} has no input view whose image exists. Restore the images, or give another folder.")
-    train, test = split(source, config)
+    train, test = split(dataset, config)
     if not train:
         raise InputError(f"{root} has no input view left after the test views were held out. Add images.")
-    warnings = list(source.warnings)
-    origin = _origin(source.frames + (source.held_out or []), warnings)  # the same whichever views are chosen
+    warnings = list(dataset.warnings)
+    origin = _origin(dataset.frames + (dataset.held_out or []), warnings)  # the same whichever views are chosen
     views, has_alpha = _views(root, train + test, origin, config)
     return Scene(
         path=root,
-        kind=source.kind,
+        kind=dataset.kind,
         train=views[: len(train)],
         test=views[len(train) :],
-        points=_points(source, origin),
+        points=_points(dataset, origin),
         has_alpha=all(has_alpha[: len(train)]),
         warnings=tuple(warnings),
         origin=(float(origin[0]), float(origin[1]), float(origin[2])),
@@ -133,7 +133,7 @@ def is_posed(root: Path) -> bool:
     )
 
 
-def read_source(root: Path) -> Source:
+def read_dataset(root: Path) -> Dataset:
     """The dataset in a folder, before anything is chosen. InputError where there is none."""
     if not root.is_dir():
         raise InputError(
@@ -150,7 +150,7 @@ def read_source(root: Path) -> Source:
     )
 
 
-def _origin(frames: list[Frame], warnings: list[str]) -> Float[Tensor, "3"]:
+def _origin(frames: list[PosedImage], warnings: list[str]) -> Float[Tensor, "3"]:
     """Zero, or the rounded mean camera centre when the scene lies too far out for float32."""
     centers = torch.stack([-frame.viewmat[:3, :3].T @ frame.viewmat[:3, 3] for frame in frames])
     mean = centers.mean(0)
@@ -166,21 +166,23 @@ def _origin(frames: list[Frame], warnings: list[str]) -> Float[Tensor, "3"]:
     return origin
 
 
-def _views(root: Path, frames: list[Frame], origin: Tensor, config: DataConfig) -> tuple[tuple[View, ...], list[bool]]:
+def _views(
+    root: Path, frames: list[PosedImage], origin: Tensor, config: DataConfig
+) -> tuple[tuple[View, ...], list[bool]]:
     """Views that share one store, and which of them have alpha."""
     pinholes: dict[tuple[object, ...], Undistortion] = {}
     prepared = [_prepare(root, frame, config.downscale, pinholes) for frame in frames]
-    store = ImageStore([picture for picture, _, _ in prepared], config.cache_mb)
+    store = ImageStore([image for image, _, _ in prepared], config.cache_mb)
     views = tuple(
-        View(frame.name, _camera(frame, K, origin, picture), store, index)
-        for index, (frame, (picture, K, _)) in enumerate(zip(frames, prepared, strict=True))
+        View(frame.name, _camera(frame, K, origin, image), store, index)
+        for index, (frame, (image, K, _)) in enumerate(zip(frames, prepared, strict=True))
     )
     return views, [alpha for _, _, alpha in prepared]
 
 
 def _prepare(
-    root: Path, frame: Frame, factor: int, pinholes: dict[tuple[object, ...], Undistortion]
-) -> tuple[Picture, Tensor, bool]:
+    root: Path, frame: PosedImage, factor: int, pinholes: dict[tuple[object, ...], Undistortion]
+) -> tuple[ImageSource, Tensor, bool]:
     """How the frame's file becomes working pixels, the pinhole K at working size, and whether there is alpha."""
     path, stored = _stored_image(root, frame, factor)
     width, height = (downscaled_size(extent, factor) for extent in (frame.width, frame.height))
@@ -193,12 +195,12 @@ def _prepare(
         K = undistortion.pinhole
     if path != frame.path:
         width, height = stored
-    picture = Picture(path, frame.mask, stored, undistortion, width, height)
+    image = ImageSource(path, frame.mask, stored, undistortion, width, height)
     alpha = frame.mask is not None or read_header(path)[2]
-    return picture, _resized(K, stored, (width, height)), alpha
+    return image, _resized(K, stored, (width, height)), alpha
 
 
-def _stored_image(root: Path, frame: Frame, factor: int) -> tuple[Path, tuple[int, int]]:
+def _stored_image(root: Path, frame: PosedImage, factor: int) -> tuple[Path, tuple[int, int]]:
     """The file to read and its size: images_N/ when there is one for `factor`, else the frame's own."""
     declared = (frame.width, frame.height)
     name = Path(frame.name)
@@ -221,14 +223,14 @@ def _resized(K: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor:
     return K * torch.tensor([new[0] / old[0], new[1] / old[1], 1.0], dtype=K.dtype)[:, None]
 
 
-def _camera(frame: Frame, K: Tensor, origin: Tensor, picture: Picture) -> Cameras:
+def _camera(frame: PosedImage, K: Tensor, origin: Tensor, image: ImageSource) -> Cameras:
     viewmat = frame.viewmat.clone()
     viewmat[:3, 3] += viewmat[:3, :3] @ origin  # x_cam = R (x' + origin) + t
-    camera = Cameras(viewmat[None].float(), K[None].float(), picture.width, picture.height)
+    camera = Cameras(viewmat[None].float(), K[None].float(), image.width, image.height)
     return camera.validate()
 
 
-def _points(source: Source, origin: Tensor) -> Points | None:
-    if source.xyz is None or source.rgb is None or len(source.xyz) == 0:
+def _points(dataset: Dataset, origin: Tensor) -> Points | None:
+    if dataset.xyz is None or dataset.rgb is None or len(dataset.xyz) == 0:
         return None
-    return Points((source.xyz - origin).float(), source.rgb)
+    return Points((dataset.xyz - origin).float(), dataset.rgb)

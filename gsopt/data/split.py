@@ -7,24 +7,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.config.train import DataConfig
-from gsopt.data.posed_images import Frame, Source
+from gsopt.data.posed_images import Dataset, PosedImage
 from gsopt.errors import UsageError
 
 HOLD_OUT_EVERY = 8
 
 
-def split(source: Source, config: DataConfig) -> tuple[list[Frame], list[Frame]]:
+def split(dataset: Dataset, config: DataConfig) -> tuple[list[PosedImage], list[PosedImage]]:
     """(train, test): the dataset's own test frames, else every 8th by name when `config.eval`, else no test."""
-    train, test = source.frames, source.held_out
+    train, test = dataset.frames, dataset.held_out
     if test is None:
         by_name = sorted(train, key=lambda frame: frame.name)
         test = by_name[::HOLD_OUT_EVERY] if config.eval else []
         held_out = {id(frame) for frame in test}
         train = [frame for frame in train if id(frame) not in held_out]
-    return _chosen(train, config, source.kind) if train else [], test
+    return _chosen(train, config, dataset.kind) if train else [], test
 
 
-def _chosen(train: list[Frame], config: DataConfig, kind: str) -> list[Frame]:
+def _chosen(train: list[PosedImage], config: DataConfig, kind: str) -> list[PosedImage]:
     if config.view_ids is not None:
         return _by_ids(train, config.view_ids, kind)
     if config.views is None:
@@ -37,7 +37,7 @@ def _chosen(train: list[Frame], config: DataConfig, kind: str) -> list[Frame]:
     return [train[row] for row in sorted(farthest_points(centers, config.views))]
 
 
-def _by_ids(train: list[Frame], ids: tuple[int, ...], kind: str) -> list[Frame]:
+def _by_ids(train: list[PosedImage], ids: tuple[int, ...], kind: str) -> list[PosedImage]:
     # NeRF-synthetic counts rows of the file, so that ids keep their meaning when an image is absent.
     rows = {frame.position: frame for frame in train} if kind == "nerf-synthetic" else dict(enumerate(train))
     for view in ids:

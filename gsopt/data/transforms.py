@@ -18,7 +18,7 @@ from gsopt.data.images import read_header
 from gsopt.data.lens import Lens
 from gsopt.data.masks import find_mask
 from gsopt.data.pointcloud import read_points_ply
-from gsopt.data.posed_images import Frame, Source, check_enough, read_pose, summarize_names
+from gsopt.data.posed_images import Dataset, PosedImage, check_enough, read_pose, summarize_names
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import intrinsics, viewmats_from_opengl
 
@@ -27,7 +27,7 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 
 
-def read_transforms(root: Path) -> Source:
+def read_transforms(root: Path) -> Dataset:
     """Read a folder that has transforms_train.json or transforms.json. Raises InputError."""
     synthetic = files.is_regular(root / "transforms_train.json")
     path = root / ("transforms_train.json" if synthetic else "transforms.json")
@@ -35,7 +35,7 @@ def read_transforms(root: Path) -> Source:
     warnings: list[str] = []
     frames, absent = read_frames(document, path, warnings)
     check_enough(frames, absent, path)
-    held_out: list[Frame] | None = None
+    held_out: list[PosedImage] | None = None
     for name in ("transforms_test.json", "transforms_val.json"):
         if held_out is None and files.is_regular(root / name):
             held_out = read_frames(files.read_json(root / name), root / name, warnings)[0] or None
@@ -44,15 +44,15 @@ def read_transforms(root: Path) -> Source:
     if not synthetic:
         frames.sort(key=lambda frame: frame.name)
     xyz, rgb = _points(document, root, warnings)
-    return Source("nerf-synthetic" if synthetic else "nerfstudio", frames, held_out, xyz, rgb, warnings)
+    return Dataset("nerf-synthetic" if synthetic else "nerfstudio", frames, held_out, xyz, rgb, warnings)
 
 
-def read_frames(document: dict[str, Any], path: Path, warnings: list[str]) -> tuple[list[Frame], list[str]]:
+def read_frames(document: dict[str, Any], path: Path, warnings: list[str]) -> tuple[list[PosedImage], list[str]]:
     """The frames whose image exists, in file order, and the names of the others, which `warnings` tells of."""
     entries = document.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} has no list `frames` with at least one entry. Export the dataset again.")
-    frames: list[Frame] = []
+    frames: list[PosedImage] = []
     absent: list[str] = []
     for position, entry in enumerate(entries):
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
@@ -83,7 +83,7 @@ def _find_image(root: Path, file_path: str) -> Path | None:
 
 def _frame(
     document: dict[str, Any], entry: dict[str, Any], position: int, image: Path, path: Path, warnings: list[str]
-) -> Frame:
+) -> PosedImage:
     where = f"frame {entry['file_path']!r} in {path}"
     values = {**{key: value for key, value in document.items() if key != "frames"}, **entry}
     width, height = _size(values, image, where)
@@ -97,7 +97,7 @@ def _frame(
             mask = None
     elif (path.parent / "masks").is_dir():
         mask = find_mask(path.parent / "masks", _inside_images(entry["file_path"], image))
-    return Frame(
+    return PosedImage(
         name=files.relative_name(image, path.parent),
         path=image,
         mask=mask,
@@ -165,7 +165,9 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
     return Lens(radial=(read("k1"), read("k2"), read("k3"), read("k4")), tangential=tangential, fisheye=fisheye)
 
 
-def _pick_test(frames: list[Frame], document: dict[str, Any], root: Path) -> tuple[list[Frame], list[Frame]]:
+def _pick_test(
+    frames: list[PosedImage], document: dict[str, Any], root: Path
+) -> tuple[list[PosedImage], list[PosedImage]]:
     """(test, input) by nerfstudio's `test_filenames`; what `val_filenames` names is neither."""
 
     def named(key: str) -> set[str]:

@@ -11,21 +11,21 @@ import torch
 from dataset_builders import SIZE, save_image
 from PIL import Image
 
-from gsopt.data.images import MAX_PIXELS, ImageStore, Picture, read_gray, read_header, read_pixels
+from gsopt.data.images import MAX_PIXELS, ImageSource, ImageStore, read_gray, read_header, read_pixels
 from gsopt.errors import InputError
 
 
-def plain(path: Path, mask: Path | None = None, size: int = SIZE) -> Picture:
-    return Picture(path, mask, (SIZE, SIZE), None, size, size)
+def plain(path: Path, mask: Path | None = None, size: int = SIZE) -> ImageSource:
+    return ImageSource(path, mask, (SIZE, SIZE), None, size, size)
 
 
 def test_the_cache_never_exceeds_its_budget_and_drops_the_least_recently_used(tmp_path: Path) -> None:
     side = 512  # 1 MiB of RGBA
-    pictures = []
+    sources = []
     for i in range(4):
         save_image(tmp_path / f"{i}.png", np.full((side, side, 4), i + 1, dtype=np.uint8))
-        pictures.append(Picture(tmp_path / f"{i}.png", None, (side, side), None, side, side))
-    store = ImageStore(pictures, cache_mb=2)
+        sources.append(ImageSource(tmp_path / f"{i}.png", None, (side, side), None, side, side))
+    store = ImageStore(sources, cache_mb=2)
     first = store.get(0)
     second = store.get(1)
     assert store.get(0) is first

@@ -78,18 +78,18 @@ def test_a_distorted_capture_is_undistorted(tmp_path: Path, model: str) -> None:
     stored = np.array(Image.open(tmp_path / view.name))
     assert not np.array_equal(view.pixels().numpy(), stored)
     assert view.pixels().shape == (SIZE, SIZE, 3)  # no pixel had to be masked
-    picture = view.store.pictures[view.index]
-    assert picture.undistortion is not None
-    lens = picture.undistortion.lens
+    source = view.store.sources[view.index]
+    assert source.undistortion is not None
+    lens = source.undistortion.lens
     assert lens.fisheye == (model == "OPENCV_FISHEYE")
     assert lens.radial == (0.05, -0.02, 0.0, 0.0)
-    again = choose_pinhole(lens, picture.undistortion.K, SIZE, SIZE, "")
+    again = choose_pinhole(lens, source.undistortion.K, SIZE, SIZE, "")
     assert torch.equal(again.pinhole.float(), view.camera.Ks[0])
 
 
 def test_views_of_one_lens_share_one_undistortion(tmp_path: Path) -> None:
     scene = load_scene(nerfstudio(tmp_path, k1=0.05))
-    assert len({id(picture.undistortion) for picture in scene.train[0].store.pictures}) == 1
+    assert len({id(source.undistortion) for source in scene.train[0].store.sources}) == 1
 
 
 def test_masks_make_alpha(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_paths_may_lead_elsewhere_but_only_to_files(tmp_path: Path) -> None:
     write_json(root, document)
     scene = load_scene(root)
     assert len(scene.train) == 7
-    assert sum(view.store.pictures[view.index].path.name == "a.png" for view in scene.train) == 2
+    assert sum(view.store.sources[view.index].path.name == "a.png" for view in scene.train) == 2
 
 
 def test_an_image_is_never_taken_for_its_own_mask(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_an_image_is_never_taken_for_its_own_mask(tmp_path: Path) -> None:
     document["frames"][0]["file_path"] = str(tmp_path / "a.png")
     document["frames"][1]["file_path"] = "../a.png"
     write_json(root, document)
-    assert all(picture.mask is None for picture in load_scene(root).train[0].store.pictures)
+    assert all(source.mask is None for source in load_scene(root).train[0].store.sources)
 
 
 @pytest.mark.parametrize(("factor", "size"), [(1, (30, 21)), (2, (15, 11)), (4, (8, 5)), (64, (1, 1))])

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from gsopt.data.posed_images import Frame
+from gsopt.data.posed_images import PosedImage
 from gsopt.data.sfm.mapping import incremental_options
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import InputError
 
 
-def write_cameras(pycolmap: ModuleType, database: Path, frames: Sequence[Frame]) -> None:
+def write_cameras(pycolmap: ModuleType, database: Path, frames: Sequence[PosedImage]) -> None:
     """Put the known lens of each frame (by name) into the database, in place of the guess from EXIF."""
     known = {Path(frame.name).name: frame for frame in frames}
     with pycolmap.Database.open(database) as db:
@@ -31,7 +31,9 @@ def write_cameras(pycolmap: ModuleType, database: Path, frames: Sequence[Frame])
             db.update_camera(exact)
 
 
-def triangulate(pycolmap: ModuleType, database: Path, photos: Path, frames: Sequence[Frame], config: SfmConfig) -> Any:
+def triangulate(
+    pycolmap: ModuleType, database: Path, photos: Path, frames: Sequence[PosedImage], config: SfmConfig
+) -> Any:
     """A reconstruction with exactly the given poses and lenses, and the points their matches agree on."""
     known = {Path(frame.name).name: frame for frame in frames}
     reconstruction = pycolmap.Reconstruction()
@@ -51,7 +53,7 @@ def triangulate(pycolmap: ModuleType, database: Path, photos: Path, frames: Sequ
     return pycolmap.triangulate_points(reconstruction, database, photos, target, options=options)
 
 
-def lens_parameters(frame: Frame) -> tuple[str, list[float]]:
+def lens_parameters(frame: PosedImage) -> tuple[str, list[float]]:
     """COLMAP's model name and parameters of a frame's lens. InputError where COLMAP has no model for it."""
     lens, K = frame.lens, frame.K
     pinhole = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
@@ -66,7 +68,7 @@ def lens_parameters(frame: Frame) -> tuple[str, list[float]]:
     raise InputError(f"The lens of {frame.name} has terms that cannot be kept ({lens}). Undistort the photos first.")
 
 
-def camera_key(frame: Frame) -> str:
+def camera_key(frame: PosedImage) -> str:
     """Frames with the same text share a camera."""
     model, params = lens_parameters(frame)
     return f"{model} {frame.width}x{frame.height} {params}"

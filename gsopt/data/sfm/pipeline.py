@@ -21,8 +21,8 @@ from jaxtyping import Float
 
 from gsopt import __version__
 from gsopt._optional import require
-from gsopt.data.posed_images import Frame
-from gsopt.data.scene import read_source
+from gsopt.data.posed_images import PosedImage
+from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, features, known_poses, mapping
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import Say, ViewGraph
@@ -110,11 +110,11 @@ class _Run:
         self.say(f"read {len(photos)} photos" + (f", refused {len(refused)}" if refused else ""))
         return photos, refused
 
-    def _prior_frames(self, photos: list[Photo]) -> list[Frame] | None:
+    def _prior_frames(self, photos: list[Photo]) -> list[PosedImage] | None:
         """The known poses of these photos (`--poses prior`)."""
         if self.config.poses != "prior":
             return None
-        source = read_source(self.source)
+        source = read_dataset(self.source)
         frames = [*source.frames, *(source.held_out or [])]
         known = {frame.path.name: frame for frame in frames}
         unknown = [photo.name for photo in photos if photo.source.name not in known]
@@ -128,7 +128,7 @@ class _Run:
             photos[i] = replace(photo, camera=known_poses.camera_key(frame))
         return [replace(known[photo.source.name], name=photo.name) for photo in photos]
 
-    def _graph(self, photos: list[Photo], masked: Masked, frames: list[Frame] | None) -> tuple[ViewGraph, str]:
+    def _graph(self, photos: list[Photo], masked: Masked, frames: list[PosedImage] | None) -> tuple[ViewGraph, str]:
         names = [photo.name for photo in photos]
         matching = features.choose_matching(self.config, len(names), is_video(self.source))
         with self._timed("features"):
@@ -140,7 +140,7 @@ class _Run:
             graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.say)
         return graph, matching
 
-    def _mapped(self, masked: Masked, graph: ViewGraph, frames: list[Frame] | None) -> mapping.Mapped | None:
+    def _mapped(self, masked: Masked, graph: ViewGraph, frames: list[PosedImage] | None) -> mapping.Mapped | None:
         if len(graph.features) < mapping.SMALLEST_MODEL:
             return None
         if frames is None:
@@ -161,7 +161,7 @@ class _Run:
         report.advice += diagnosis.wide_gaps(names, viewmats)
         return report
 
-    def _placed(self, mapped: mapping.Mapped, frames: list[Frame] | None) -> Similarity:
+    def _placed(self, mapped: mapping.Mapped, frames: list[PosedImage] | None) -> Similarity:
         """Known poses stay where they are; found ones get axes, origin and scale."""
         if frames is not None:
             return Similarity.identity()

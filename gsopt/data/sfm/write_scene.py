@@ -13,7 +13,7 @@ from PIL import Image
 
 from gsopt.config.train import DataConfig
 from gsopt.data.colmap import read_colmap
-from gsopt.data.posed_images import Frame
+from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm.masks import Masked
 from gsopt.data.sfm.placement import Similarity
@@ -45,7 +45,7 @@ def write_scene(
     return scene
 
 
-def transforms(frames: Sequence[Frame], similarity: Similarity) -> dict[str, Any]:
+def transforms(frames: Sequence[PosedImage], similarity: Similarity) -> dict[str, Any]:
     """nerfstudio's transforms.json. `applied_transform` and `applied_scale` say how the world was placed."""
     applied = np.column_stack([similarity.rotation, similarity.translation / similarity.scale])
     return {
@@ -56,7 +56,7 @@ def transforms(frames: Sequence[Frame], similarity: Similarity) -> dict[str, Any
     }
 
 
-def _frame(frame: Frame) -> dict[str, Any]:
+def _frame(frame: PosedImage) -> dict[str, Any]:
     lens, K = frame.lens, frame.K
     k1, k2, k3, k4 = [*lens.radial, 0.0, 0.0, 0.0, 0.0][:4]
     entry = {
@@ -112,8 +112,8 @@ def _write_undistorted(pycolmap: ModuleType, reconstruction: Any, found: Path, s
 
 def _write_view(view: View, found: Path, scene: Path, name: str) -> str:
     """Writes one photo and returns its name, which ends in .png where there is alpha."""
-    picture = view.store.pictures[view.index]
-    if picture.undistortion is None and picture.mask is None:
+    stored = view.store.sources[view.index]
+    if stored.undistortion is None and stored.mask is None:
         shutil.copyfile(found / "images" / name, scene / "images" / name)
         return name
     pixels = view.pixels().numpy()

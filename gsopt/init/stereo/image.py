@@ -19,7 +19,7 @@ _MULTIPLE = 8
 
 
 @dataclass(frozen=True)
-class Picture:
+class StereoImage:
     """A photo whose width is a multiple of 8, as the matching kernel wants it."""
 
     camera: Cameras
@@ -27,13 +27,13 @@ class Picture:
     """0..1."""
 
     @staticmethod
-    def of(photo: Photo, pixels: int) -> Picture:
+    def of(photo: Photo, pixels: int) -> StereoImage:
         """The photo with about so many pixels, no more than it has."""
         shrink = math.sqrt(min(1.0, pixels / (photo.camera.width * photo.camera.height)))
         width = max(_MULTIPLE, round(photo.camera.width * shrink / _MULTIPLE) * _MULTIPLE)
         height = max(_MULTIPLE, round(photo.camera.height * shrink))
         rgb = torch.nn.functional.interpolate(photo.planes[None, :3].float() / 255, (height, width), mode="area")[0]
-        return Picture(photo.camera.resized(width, height), rgb)
+        return StereoImage(photo.camera.resized(width, height), rgb)
 
     @cached_property
     def gray(self) -> Float[Tensor, "H W"]:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.init.stereo.image import Picture
+from gsopt.init.stereo.image import StereoImage
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 
 RADIUS, STRIDE = 2, 2
@@ -34,7 +34,7 @@ TAPS = [(float(dx), float(dy)) for dy in _STEPS for dx in _STEPS]
 class Matcher:
     """The windows of one picture against `sources`; `workspace` as `cpu_backend.workspace` makes it."""
 
-    def __init__(self, reference: Picture, sources: Sequence[Picture], workspace: Any) -> None:
+    def __init__(self, reference: StereoImage, sources: Sequence[StereoImage], workspace: Any) -> None:
         self._workspace = workspace
         self._shape = (reference.camera.height, reference.camera.width)
         K = reference.camera.Ks[0]
@@ -85,7 +85,7 @@ def corners(gray: Float[Tensor, "H W"]) -> Float[Tensor, "H W 4"]:
     return torch.cat([both, torch.cat([both[1:], both[-1:]])], -1)
 
 
-def _motion(reference: Picture, source: Picture) -> tuple[Any, Any]:
+def _motion(reference: StereoImage, source: StereoImage) -> tuple[Any, Any]:
     """A and T: a ray (x, y, 1) of inverse depth w is seen at the source's pixel A (x, y, 1) + T w, over its last."""
     motion = source.camera.viewmats[0].double() @ torch.linalg.inv(reference.camera.viewmats[0].double())
     K = source.camera.Ks[0].double()

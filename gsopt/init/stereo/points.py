@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsopt.data.scene import Scene
 from gsopt.geometry.projection import Focus, find_focus, inside, project
-from gsopt.init.stereo.image import Picture
+from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.matching import Matcher
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
 from gsopt.init.thumbnails import Photo, small_photos
@@ -65,7 +65,7 @@ def plane_maps(photos: Sequence[Photo], focus: Focus, generator: torch.Generator
     threads = workspace(torch.get_num_threads())
     maps: list[PlaneMap] = []
     for pixels, rounds, shake in LEVELS:
-        pictures = [Picture.of(photo, pixels) for photo in photos]
+        pictures = [StereoImage.of(photo, pixels) for photo in photos]
         starts = [
             maps[index].enlarged(picture) if maps else random_planes(picture, reach, generator)
             for index, picture in enumerate(pictures)
@@ -77,10 +77,10 @@ def plane_maps(photos: Sequence[Photo], focus: Focus, generator: torch.Generator
     return maps
 
 
-def nearest(picture: Picture, pictures: Sequence[Picture], focus: Focus) -> list[Picture]:
+def nearest(picture: StereoImage, pictures: Sequence[StereoImage], focus: Focus) -> list[StereoImage]:
     """The others that most likely show the same: near in place and direction."""
 
-    def apart(other: Picture) -> float:
+    def apart(other: StereoImage) -> float:
         away = (other.camera.centers[0] - picture.camera.centers[0]).norm()
         turned = 1 - (other.camera.forwards[0] * picture.camera.forwards[0]).sum()
         return float(away + 2 * focus.distance * turned)
@@ -107,7 +107,7 @@ def agreed(here: PlaneMap, others: Sequence[PlaneMap]) -> Bool[Tensor, "H W"]:
     return found.view(here.costs.shape) & (here.costs < MATCHED)
 
 
-def _angles(points: Float[Tensor, "N 3"], one: Picture, other: Picture) -> Float[Tensor, "N"]:
+def _angles(points: Float[Tensor, "N 3"], one: StereoImage, other: StereoImage) -> Float[Tensor, "N"]:
     """Between the directions in which two cameras see points, degrees."""
     a, b = points - one.camera.centers[0], points - other.camera.centers[0]
     across = torch.linalg.cross(a, b).norm(dim=-1)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.init.stereo.image import Picture
+from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.matching import Matcher
 
 BEST = 1
@@ -32,7 +32,7 @@ class Reach:
 class PlaneMap:
     """The plane that each pixel of a picture shows."""
 
-    picture: Picture
+    picture: StereoImage
     planes: Float[Tensor, "3 H W"]
     """Inverse depth a x + b y + c of the ray (x, y, 1)."""
     costs: Float[Tensor, "H W"]
@@ -41,7 +41,7 @@ class PlaneMap:
     def inverse_depths(self) -> Float[Tensor, "H W"]:
         return at(self.planes, self.picture.rays)
 
-    def enlarged(self, picture: Picture) -> Float[Tensor, "3 H W"]:
+    def enlarged(self, picture: StereoImage) -> Float[Tensor, "3 H W"]:
         """The planes for a larger copy of the picture."""
         size = (picture.camera.height, picture.camera.width)
         return torch.nn.functional.interpolate(self.planes[None], size, mode="nearest")[0]
@@ -52,7 +52,7 @@ def at(planes: Float[Tensor, "3 H W"], rays: Float[Tensor, "2 H W"]) -> Float[Te
     return planes[0] * rays[0] + planes[1] * rays[1] + planes[2]
 
 
-def random_planes(picture: Picture, reach: Reach, generator: torch.Generator) -> Float[Tensor, "3 H W"]:
+def random_planes(picture: StereoImage, reach: Reach, generator: torch.Generator) -> Float[Tensor, "3 H W"]:
     """Uniform in inverse depth, slopes normal."""
     x, y = picture.rays
     w = reach.far + (reach.near - reach.far) * torch.rand(x.shape, generator=generator)
@@ -63,7 +63,7 @@ def random_planes(picture: Picture, reach: Reach, generator: torch.Generator) ->
 class Search:
     """The planes of one picture, getting better."""
 
-    def __init__(self, picture: Picture, matcher: Matcher, reach: Reach, planes: Float[Tensor, "3 H W"]) -> None:
+    def __init__(self, picture: StereoImage, matcher: Matcher, reach: Reach, planes: Float[Tensor, "3 H W"]) -> None:
         self._picture, self._matcher, self._reach = picture, matcher, reach
         self._planes = planes
         self._costs = self._cost(planes)

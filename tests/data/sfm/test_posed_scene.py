@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsopt import cli
 from gsopt.data.colmap import read_colmap
-from gsopt.data.posed_images import Frame
+from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import load_scene
 from gsopt.data.sfm.pipeline import Posed, pose_photos
 from gsopt.data.sfm.reuse import needs_poses, posed_scene
@@ -27,7 +27,7 @@ ROTATION, POSITION = 0.3, 0.005
 """Degrees, and share of the path: pictures of 400 px carry no more."""
 
 
-def viewmats(frames: list[Frame]) -> np.ndarray:
+def viewmats(frames: list[PosedImage]) -> np.ndarray:
     return np.stack([frame.viewmat.numpy() for frame in frames])
 
 

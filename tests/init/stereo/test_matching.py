@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsopt.geometry.cameras import Cameras
-from gsopt.init.stereo.image import Picture
+from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.matching import LEAST_VARIANCE, TAPS, UNSEEN, Matcher, windows
 from gsopt.raster import _cpu
 from gsopt.raster.cpu_backend import ISA_VARIABLE, workspace
@@ -22,12 +22,12 @@ BORDER = 1e-3
 """Windows whose outermost tap lies so near the other picture's border, in pixels, are left out: it decides all."""
 
 
-def picture(seed: int, viewmat: Tensor, width: int = 40, height: int = 30) -> Picture:
+def picture(seed: int, viewmat: Tensor, width: int = 40, height: int = 30) -> StereoImage:
     generator = torch.Generator().manual_seed(seed)
     K = torch.tensor([[1.1 * width, 0, 0.45 * width], [0, 1.2 * width, 0.55 * height], [0, 0, 1]])
     coarse = torch.rand(1, 3, 6, 8, generator=generator)
     rgb = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0]
-    return Picture(Cameras(viewmat[None].float(), K[None], width, height), rgb)
+    return StereoImage(Cameras(viewmat[None].float(), K[None], width, height), rgb)
 
 
 def moved(seed: int) -> Tensor:
@@ -40,7 +40,7 @@ def moved(seed: int) -> Tensor:
     return motion
 
 
-def plain_costs(reference: Picture, source: Picture, planes: Tensor) -> tuple[Tensor, Tensor]:
+def plain_costs(reference: StereoImage, source: StereoImage, planes: Tensor) -> tuple[Tensor, Tensor]:
     """Cost of every pixel in float64, and how near its window comes to the source's border, px."""
     weights, centered = (t.double() for t in windows(reference.gray))
     K, K2 = reference.camera.Ks[0].double(), source.camera.Ks[0].double()
@@ -99,7 +99,7 @@ def test_some_windows_are_seen_and_some_are_not() -> None:
 
 def test_a_picture_matches_itself_and_not_its_negative() -> None:
     one = picture(5, torch.eye(4))
-    negative = Picture(one.camera, 1 - one.rgb)
+    negative = StereoImage(one.camera, 1 - one.rgb)
     planes = torch.ones(3, *one.gray.shape)
     same, opposite = Matcher(one, [one, negative], workspace(1)).costs(planes)
     seen = same < UNSEEN
@@ -110,7 +110,7 @@ def test_a_picture_matches_itself_and_not_its_negative() -> None:
 
 
 def test_what_shows_nothing_matches_nothing() -> None:
-    blank = Picture(picture(1, torch.eye(4)).camera, torch.full((3, 30, 40), 0.4))
+    blank = StereoImage(picture(1, torch.eye(4)).camera, torch.full((3, 30, 40), 0.4))
     (cost,) = Matcher(blank, [blank], workspace(1)).costs(torch.ones(3, 30, 40))
     assert float((cost[cost < UNSEEN] - 1).abs().max()) < 0.05
 
@@ -129,7 +129,7 @@ def test_the_rooms_own_floor_matches_better_than_another(tmp_path) -> None:
     from gsopt.init.thumbnails import small_photos
 
     scene = room_scene(tmp_path / "room", room.arc(4))
-    first, second = (Picture.of(photo, 8000) for photo in small_photos(scene.train, 4)[:2])
+    first, second = (StereoImage.of(photo, 8000) for photo in small_photos(scene.train, 4)[:2])
     R, center = first.camera.viewmats[0, :3, :3], first.camera.centers[0]
     # The floor z = 0 seen from the camera: depth * (Rᵀ ray)_z + center_z = 0.
     floor = [(-R[k, 2] / center[2]).item() for k in range(3)]
