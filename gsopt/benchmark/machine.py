@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from gsopt import __version__
+from gsopt._version import __version__
 
 
 def machine() -> dict[str, Any]:

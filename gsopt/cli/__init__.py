@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.errors import GsoptError, UsageError
 
 VERBS = {

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.errors import GsoptError
 
 if TYPE_CHECKING:

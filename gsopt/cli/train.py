@@ -254,11 +254,12 @@ def guidance_config(flags: Guidance) -> GuidanceConfig:
 
     for text in (*flags.prompt, *flags.negative):
         Prompt(text)
-    images = accepted_images(Path(flags.prompts)) if flags.prompts else ()
+    if flags.prompts:
+        accepted_images(Path(flags.prompts))
     values = dataclasses.asdict(flags)
     for name in ("prompts", "prior", "clip", "tiny_vae"):
         values[name] = absolute(values[name])
-    values["ref_image"] = tuple(absolute(path) for path in (*flags.ref_image, *map(str, images)))
+    values["ref_image"] = tuple(absolute(path) for path in flags.ref_image)
     config = GuidanceConfig(**values)
     choose(config)
     return config

@@ -20,11 +20,11 @@ T = TypeVar("T")
 
 MOST = 1e9
 """Upper bound of weights and rates: keeps infinities and typing errors out."""
-LARGEST = 1e300
+MAX_JSON_NUMBER = 1e300
 """No number of a file reaches it: whole numbers may be longer than a float holds, and sums must not overflow."""
-LARGEST_CONFIG = 1 << 20
+MAX_CONFIG_BYTES = 1 << 20
 """Bytes of config.json that are read."""
-MOST_GAUSSIANS = 100_000_000
+MAX_GAUSSIANS = 100_000_000
 """More than any machine this runs on can hold."""
 
 
@@ -71,7 +71,7 @@ class InitConfig:
 
     def __post_init__(self) -> None:
         check.one_of("--init", self.method, ("auto", "points", "hull", "stereo", "random"))
-        check.within("--init-count", self.count, 1, MOST_GAUSSIANS, "The default is 20000.")
+        check.within("--init-count", self.count, 1, MAX_GAUSSIANS, "The default is 20000.")
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class DensityConfig:
     def __post_init__(self) -> None:
         check.one_of("--strategy", self.strategy, ("adc", "mcmc"))
         if self.max_gaussians is not None:
-            check.within("--max-gaussians", self.max_gaussians, 1, MOST_GAUSSIANS, "Drop the flag for the default.")
+            check.within("--max-gaussians", self.max_gaussians, 1, MAX_GAUSSIANS, "Drop the flag for the default.")
         check.at_least("--density.refine-start", self.refine_start, 0, "The default is 500.")
         check.at_least("--density.refine-stop", self.refine_stop or 0, 0, "Drop the flag for the default.")
         check.at_least("--density.refine-every", self.refine_every, 1, "The default is 100.")
@@ -323,7 +323,7 @@ class TrainConfig:
         """The `config` of a run's config.json."""
         try:
             with open(path, "rb") as file:
-                document = json.loads(file.read(LARGEST_CONFIG))
+                document = json.loads(file.read(MAX_CONFIG_BYTES))
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(
                 f"Cannot read the configuration {path}: {error}. Give the folder of a gsopt run."
@@ -361,7 +361,7 @@ def _matches(hint: Any, value: Any) -> bool:
     if origin is tuple:
         return isinstance(value, (list, tuple)) and all(_matches(args[0], item) for item in value)
     if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < LARGEST
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < MAX_JSON_NUMBER
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     return value is None if hint is type(None) else isinstance(value, hint)

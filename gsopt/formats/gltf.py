@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import gsopt
+from gsopt._version import __version__
 from gsopt.errors import InputError
 from gsopt.formats.axes import LEFT_UP_FORWARD, turned
 from gsopt.formats.files import opened, replacing
@@ -98,7 +98,7 @@ def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dic
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     return {
-        "asset": {"version": "2.0", "generator": f"gsopt {gsopt.__version__}"},
+        "asset": {"version": "2.0", "generator": f"gsopt {__version__}"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

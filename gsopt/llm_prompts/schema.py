@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from gsopt.config.train import LARGEST
+from gsopt.config.train import MAX_JSON_NUMBER
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
 
@@ -250,7 +250,7 @@ def _require_text(value: Any, name: str, longest: int) -> None:
 
 
 def _require_number(value: Any, name: str, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < MAX_JSON_NUMBER:
         raise InputError(f"`{name}` must be a number, got {value!r:.80}. Correct it.")
     if not low <= value <= high:
         raise InputError(f"`{name}` must lie in [{low:g}, {high:g}], got {value}. Correct it.")

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
 from gsopt.errors import GsoptError, InputError, UsageError
 from gsopt.events import EventWriter, to_json, write_atomic

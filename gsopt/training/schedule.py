@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from gsopt.config.train import MOST_GAUSSIANS, DensityConfig, OptimizerConfig, TrainConfig
+from gsopt.config.train import MAX_GAUSSIANS, DensityConfig, OptimizerConfig, TrainConfig
 
 # Published end of refinement (Kerbl et al. 2023; Kheradmand et al. 2024), and its share of a shorter run.
 REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}
@@ -120,7 +120,7 @@ def max_gaussians(config: TrainConfig, pixels: float) -> int:
 
 def budget(config: DensityConfig) -> int:
     """The resolved limit on the number of Gaussians."""
-    return MOST_GAUSSIANS if config.max_gaussians is None else config.max_gaussians
+    return MAX_GAUSSIANS if config.max_gaussians is None else config.max_gaussians
 
 
 def downscale(step: int, coarse_until: tuple[int, ...]) -> int:

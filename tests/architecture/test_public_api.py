@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -39,3 +41,11 @@ def test_a_public_name_loads_and_says_what_it_is(name: str) -> None:
 def test_another_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'rasterise'"):
         gsopt.rasterise  # noqa: B018 - the access is the test
+
+
+@pytest.mark.parametrize(
+    ("file", "table"), [("pyproject.toml", "project"), ("blender_addon/blender_manifest.toml", "")]
+)
+def test_every_file_that_states_the_version_states_the_same(root: Path, file: str, table: str) -> None:
+    document = tomllib.loads((root / file).read_text(encoding="utf-8"))
+    assert (document[table] if table else document)["version"] == gsopt.__version__

@@ -1,6 +1,6 @@
 """Install the built extension from its zip, enable, disable, enable again, uninstall; nothing may be left behind.
 
-    BLENDER_USER_RESOURCES=FOLDER python tests/blender/install.py -- gsopt-0.1.0.zip      (or blender -b -P ... -- ZIP)
+    BLENDER_USER_RESOURCES=FOLDER python tests/blender/install.py -- gsopt-0.2.0.zip      (or blender -b -P ... -- ZIP)
 
 Prints what it found as one line of JSON, beginning with `found `.
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,9 +15,11 @@ from tiny_scenes import write_dataset
 
 from gsopt import cli
 from gsopt.cli.train import Guidance, guidance_config
+from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError
 from gsopt.llm_prompts.review import Abandoned, edited, review
 from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, read_set, write_set
+from gsopt.training.guided.session import reference_paths
 
 NOTES = ["--notes", "femur, osteoporotic, CT", "--domain", "medicine"]
 HEAVY = {"torch", "numpy", "PIL", "pydantic", "tokenizers", "transformers", "diffusers", "urllib.request"}
@@ -145,7 +148,10 @@ def test_training_reads_the_prompts_and_the_pictures_that_were_accepted(tmp_path
     write_set(tmp_path / "prompts.json", PromptSet((Prompt("a chair"),), images=pictures))
     flags = Guidance(prompts=str(tmp_path / "prompts.json"), prior="a/b", ref_image=("mine.png",))
     config = guidance_config(flags)
-    assert config.ref_image == ("mine.png", str(tmp_path / "prompts-images" / "001.png"))
+    accepted = str(tmp_path / "prompts-images" / "001.png")
+    assert reference_paths(TrainConfig(guidance=config)) == ("mine.png", accepted)
+    old = replace(config, ref_image=("mine.png", accepted))  # a run of gsopt 0.1.0 recorded both
+    assert reference_paths(TrainConfig(guidance=old)) == ("mine.png", accepted)
     assert config.prompts == str(tmp_path / "prompts.json")
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from PIL import Image
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.benchmark.suite import definition as declared
 from gsopt.benchmark.suite.aggregate import Way
 from gsopt.benchmark.suite.tables import Part, about, missing, parts

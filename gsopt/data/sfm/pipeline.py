@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gsopt import __version__
 from gsopt._optional import require
+from gsopt._version import __version__
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, features, known_poses, mapping

@@ -10,7 +10,7 @@ from importlib import resources
 
 from PIL import Image
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.results.report.page import POLICY
 from gsopt.results.report.pictures import data_uri
 

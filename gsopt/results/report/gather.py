@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from PIL import Image
 
-from gsopt.config.train import LARGEST, TrainConfig
+from gsopt.config.train import MAX_JSON_NUMBER, TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
 from gsopt.events import LARGEST_METRICS, read_events
@@ -111,7 +111,7 @@ def gather(run: Path, config: TrainConfig) -> Report:
 
 def number(value: object) -> float | None:
     """A finite number, or None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_JSON_NUMBER:
         return None
     return float(value)
 

@@ -7,7 +7,7 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-from gsopt import __version__
+from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
 from gsopt.results.report.charts import line_chart
 from gsopt.results.report.gather import Judged, Report, number

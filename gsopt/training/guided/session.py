@@ -17,7 +17,7 @@ from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
-from gsopt.llm_prompts.schema import Prompt, read_prompts, write_prompts
+from gsopt.llm_prompts.schema import Prompt, accepted_images, read_prompts, write_prompts
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.results.finished_run import to_bytes
 from gsopt.results.video import save_stills
@@ -43,7 +43,7 @@ SHOWN_STEPS = 4
 def make_conditioning(config: TrainConfig, scene: Scene, prior: Prior, folder: Path, warn: Warn) -> Conditioning:
     """The run's conditioning, prompts and images encoded, saved for a session that resumes the run."""
     prompts = read_guidance_prompts(config)
-    references = read_references(config.guidance.ref_image, prior.size)
+    references = read_references(reference_paths(config), prior.size)
     step = max(1, -(-len(scene.train) // EMBEDDED_INPUTS))
     inputs = square_views(scene.train[::step], prior.size, torch.ones(3)).images
     made = knowledge.encode(
@@ -68,6 +68,13 @@ def read_guidance_prompts(config: TrainConfig) -> list[Prompt]:
     prompts = [Prompt(text) for text in guidance.prompt]
     prompts += [Prompt(text, polarity="negative") for text in guidance.negative]
     return prompts + (list(read_prompts(Path(guidance.prompts))) if guidance.prompts else [])
+
+
+def reference_paths(config: TrainConfig) -> tuple[str, ...]:
+    """Paths of the reference images: those of `ref_image`, then those accepted in the prompts.json."""
+    given, prompts = config.guidance.ref_image, config.guidance.prompts
+    accepted = map(str, accepted_images(Path(prompts)) if prompts else ())
+    return (*given, *(path for path in accepted if path not in given))
 
 
 def read_references(paths: tuple[str, ...], size: int) -> Images:
