@@ -15,8 +15,8 @@ from torch import Tensor
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import quats
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
+from gsopt.geometry.morton import morton_order
 from gsopt.init.neighbors import mean_neighbor_distance
-from gsopt.training.morton import morton_order
 
 TORUS_RADIUS, TUBE, SPHERE, GROUND = 1.0, 0.35, 0.5, 1.45
 FLATNESS = 0.1

@@ -54,7 +54,7 @@ def save_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     in ±3.9, clamped outside; each component of the unit quaternion, up to its sign, 0.0021.
     """
     gaussians = storable(gaussians, path)
-    gaussians = gaussians.select(torch.from_numpy(morton_order(gaussians.means.numpy())))
+    gaussians = gaussians.select(morton_order(gaussians.means.double().flip(-1)))  # x decides first
     chunks, packed = _pack(gaussians)
     with replacing(path) as file:
         file.write(_header(gaussians, len(chunks)))

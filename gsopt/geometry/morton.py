@@ -1,35 +1,36 @@
-"""Z-order: a walk through space along which neighbors mostly stay neighbors (Morton 1966)."""
+"""Z-order: points that are near in space become near in memory (Morton 1966)."""
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Float
-from numpy.typing import NDArray
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
-_BITS = 21
+BITS = 21
 """Per axis: three axes fill 63 bits."""
+# Each step moves the upper half of the bits up, until two zeros stand between any two.
+_SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
 
 
-def morton_order(points: Float[np.ndarray, "N 3"]) -> NDArray[np.int64]:
-    """Indices that sort `points` along a Z-curve through their bounding box; ties keep their order."""
+def morton_order(points: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
+    """Indices that sort `points` along a Z curve through their bounding box; the last axis decides first, ties keep
+    their order."""
     if len(points) == 0:
-        return np.empty(0, np.int64)
-    low = points.min(axis=0).astype(np.float64)
-    extent = points.max(axis=0) - low
-    cells = (points - low) / np.where(extent > 0, extent, 1.0) * ((1 << _BITS) - 1)
-    spread = _every_third_bit(cells.astype(np.uint64))
-    return np.argsort(spread[:, 0] << np.uint64(2) | spread[:, 1] << np.uint64(1) | spread[:, 2], kind="stable")
+        return torch.empty(0, dtype=torch.int64)
+    low, high = points.amin(dim=0), points.amax(dim=0)
+    cells = (points - low).double() / (high - low).double().clamp_min(1e-30) * (2**BITS - 1)
+    x, y, z = (_spread(axis) for axis in cells.to(torch.int64).unbind(-1))
+    return torch.argsort(x | (y << 1) | (z << 2), stable=True)
 
 
-def _every_third_bit(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Bit i moved to bit 3 i, by halving the groups that move together."""
-    steps = (
-        (32, 0x001F00000000FFFF),
-        (16, 0x001F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    )
-    for shift, mask in steps:
-        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+def _spread(values: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    """Two zero bits between every two bits of a 21-bit number."""
+    for shift, mask in _SPREAD:
+        values = (values | (values << shift)) & mask
     return values

@@ -15,12 +15,12 @@ from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.morton import morton_order
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.training import schedule
 from gsopt.training.checkpoint import Checkpoint
 from gsopt.training.density import at_least_one, make_density
 from gsopt.training.floaters import solitary
-from gsopt.training.morton import morton_order
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 from gsopt.training.order import ViewOrder, generators
 from gsopt.training.poses import PoseRefinement

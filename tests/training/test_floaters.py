@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gsopt.geometry.morton import morton_order
 from gsopt.training import floaters
 from gsopt.training.floaters import neighbor_distances, solitary
-from gsopt.training.morton import morton_order
 
 
 def blob(count: int, seed: int = 0) -> torch.Tensor:

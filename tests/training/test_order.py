@@ -1,13 +1,11 @@
-"""The order of views, of random numbers and of Gaussians in memory."""
+"""The order of views and of random numbers."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.training.morton import BITS, morton_order
 from gsopt.training.order import ViewOrder, generators
 
 
@@ -37,27 +35,3 @@ def test_epochs_are_shuffled_anew() -> None:
 def test_no_two_purposes_or_seeds_share_their_numbers() -> None:
     draws = [tuple(torch.rand(4, generator=g).tolist()) for seed in range(5) for g in generators(seed).values()]
     assert len(set(draws)) == len(draws)
-
-
-def interleaved(point: list[int]) -> int:
-    return sum(((value >> bit) & 1) << (3 * bit + axis) for axis, value in enumerate(point) for bit in range(BITS))
-
-
-def test_morton_order_is_that_of_interleaved_bits() -> None:
-    means = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
-    low, high = means.amin(0), means.amax(0)
-    cells = ((means - low).double() / (high - low).double() * (2**BITS - 1)).long().tolist()
-    codes = [interleaved(cell) for cell in cells]
-    assert morton_order(means).tolist() == sorted(range(200), key=lambda row: codes[row])
-
-
-@pytest.mark.parametrize("means", [torch.zeros(0, 3), torch.ones(5, 3), torch.tensor([[1e30, 0, 0], [-1e30, 0, 0]])])
-def test_morton_order_is_a_permutation_of_anything_finite(means: torch.Tensor) -> None:
-    assert sorted(morton_order(means).tolist()) == list(range(len(means)))
-
-
-def test_neighbours_in_memory_are_neighbours_in_space() -> None:
-    means = torch.rand(4096, 3, generator=torch.Generator().manual_seed(1))
-    ordered = means[morton_order(means)]
-    steps, random_steps = ((x[1:] - x[:-1]).norm(dim=1).mean() for x in (ordered, means))
-    assert steps < 0.2 * random_steps
