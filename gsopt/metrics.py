@@ -37,6 +37,8 @@ VGG_NOTE = (
 )
 WEIGHTS_LIMIT = 200 * 2**20
 """No file of weights unpacks to more than this many bytes."""
+PSNR_CAP = 100.0
+"""dB; replaces the infinite PSNR of two equal images, which JSON cannot hold."""
 
 
 def psnr(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
@@ -44,6 +46,13 @@ def psnr(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) ->
     _check_pair(rendered, truth)
     mse = (rendered.double() - truth.double()).square().mean(dim=(1, 2, 3))
     return 20 * torch.log10(1 / mse.sqrt())
+
+
+def capped_psnr(
+    rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"], cap: float = PSNR_CAP
+) -> Float[Tensor, "B"]:
+    """`psnr`, at most `cap` dB."""
+    return psnr(rendered, truth).clamp(max=cap)
 
 
 def ssim(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:

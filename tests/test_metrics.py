@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsopt import metrics
 from gsopt.errors import InputError, UsageError
-from gsopt.metrics import Lpips, psnr, ssim
+from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, psnr, ssim
 
 LPIPS_TOLERANCE = 5e-5
 """Weights rounded to float16 move the distance by at most 3e-5 (measured against float32)."""
@@ -54,6 +54,7 @@ def test_psnr_of_a_constant_difference_is_its_logarithm() -> None:
 
 def test_psnr_of_equal_images_is_infinite() -> None:
     assert torch.isinf(psnr(waves(8, 9, 0), waves(8, 9, 0))).all()
+    assert bool((capped_psnr(waves(8, 9, 0), waves(8, 9, 0)) == PSNR_CAP).all())
 
 
 def test_ssim_agrees_with_its_definition_written_out() -> None:

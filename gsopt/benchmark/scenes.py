@@ -20,7 +20,6 @@ from gsopt.gaussians import Gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.results.evaluation import evaluate_views
-from gsopt.results.finished_run import BACKGROUNDS
 from gsopt.training.loop import TrainResult, train
 
 LOOKS = 8
@@ -97,7 +96,7 @@ class Judge:
         count = min(MOST_VIEWS, len(views))
         self._views = [views[i * len(views) // count] for i in range(count)]
         self._backend = make_backend("auto", 1)
-        self._background = torch.tensor(BACKGROUNDS[task.data.background])
+        self._background = torch.tensor(task.data.evaluation_background)
 
     @torch.no_grad()
     def point(self, gaussians: Gaussians, step: int, cpu: float, wall: float) -> dict[str, Any]:

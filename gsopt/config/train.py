@@ -27,6 +27,9 @@ MAX_CONFIG_BYTES = 1 << 20
 MAX_GAUSSIANS = 100_000_000
 """More than any machine this runs on can hold."""
 
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+"""Fixed backgrounds, RGB; `random` draws one per step."""
+
 
 @dataclass(frozen=True)
 class DataConfig:
@@ -47,6 +50,11 @@ class DataConfig:
     cache_mb: int = 2048
     """Decoded images kept in memory, MB; the rest is read again when needed."""
 
+    @property
+    def evaluation_background(self) -> tuple[float, float, float]:
+        """Background of renders that are evaluated or displayed: white where training drew random ones."""
+        return BACKGROUNDS.get(self.background, BACKGROUNDS["white"])
+
     def __post_init__(self) -> None:
         check.at_least("--resolution", self.downscale, 1, "1 keeps the size, 2 halves it, and so on.")
         if self.views is not None:
@@ -55,7 +63,7 @@ class DataConfig:
             raise UsageError(f"`--view-ids` must be numbers from 0 up, got {list(self.view_ids)}. Try 2,16,26.")
         if self.views is not None and self.view_ids is not None:
             raise UsageError("`--views` and `--view-ids` were both given. Keep one of them.")
-        check.one_of("--background", self.background, ("white", "black", "random"))
+        check.one_of("--background", self.background, (*BACKGROUNDS, "random"))
         check.at_least("--cache-mb", self.cache_mb, 0, "0 decodes every image again each time; the default is 2048.")
 
 

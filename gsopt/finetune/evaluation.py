@@ -12,6 +12,7 @@ from torch import Tensor
 from gsopt.finetune.batches import on_background
 from gsopt.finetune.caption_tokens import Told
 from gsopt.finetune.reconstruction_pairs import Pairs
+from gsopt.metrics import capped_psnr
 from gsopt.sds.noise import add_noise, generator
 from gsopt.sds.priors.view_conditioned import Said, cosine_schedule, predict
 
@@ -90,8 +91,7 @@ def _asked(unet: Any, images: Tensor, planes: Tensor, t: int, said: Said | None)
 
 def psnr(images: Tensor, truth: Tensor) -> float:
     """Mean over images, dB."""
-    mse = (images - truth).square().mean((1, 2, 3)).clamp_min(1e-10)
-    return round(float((-10 * mse.log10()).mean()), 3)
+    return round(float(capped_psnr(images.movedim(1, -1), truth.movedim(1, -1)).mean()), 3)
 
 
 @torch.no_grad()

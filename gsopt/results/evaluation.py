@@ -17,13 +17,11 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
 from gsopt.events import LARGEST_METRICS, to_json, write_atomic
 from gsopt.gaussians import Gaussians
-from gsopt.metrics import VGG_NOTE, Lpips, find_vgg_weights, psnr, ssim
+from gsopt.metrics import PSNR_CAP, VGG_NOTE, Lpips, capped_psnr, find_vgg_weights, ssim
 from gsopt.raster.backend import Backend, RasterSettings
 from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
 from gsopt.results.video import safe_name, save_stills
 
-PSNR_CAP = 100.0
-"""dB; stands for the infinite PSNR of two equal images, which JSON cannot hold."""
 TRAIN_SAMPLE = 16
 """With nothing held out, this many evenly spread input views are looked at."""
 DIGITS = 6
@@ -76,7 +74,7 @@ def _judge(
     picture: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], networks: dict[str, Lpips | None]
 ) -> dict[str, float | None]:
     a, b = (image[None].float() / 255 for image in (picture, target))
-    values: dict[str, float | None] = {"psnr": min(psnr(a, b).item(), PSNR_CAP), "ssim": ssim(a, b).item()}
+    values: dict[str, float | None] = {"psnr": capped_psnr(a, b).item(), "ssim": ssim(a, b).item()}
     for name, network in networks.items():
         usable = network is not None and network.fits(*picture.shape[:2])
         values[name] = network(a, b).item() if network is not None and usable else None

@@ -22,9 +22,6 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, RasterSettings
 from gsopt.results.video import safe_name, save_film, save_stills
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
-"""What a render is put on; a run that trained on random backgrounds is judged on white."""
-
 Shot = tuple[str, Cameras]
 """A file name without suffix, and the one camera to draw it from."""
 
@@ -64,7 +61,7 @@ def open_run(run: Path, backend: str | None = None, threads: int | None = None) 
         gaussians=gaussians,
         backend=make_backend(backend or config.backend, config.threads if threads is None else threads),
         settings=RasterSettings(sh_degree=gaussians.sh_degree, antialiased=config.antialiased),
-        background=torch.tensor(BACKGROUNDS[config.data.background]),
+        background=torch.tensor(config.data.evaluation_background),
     )
 
 

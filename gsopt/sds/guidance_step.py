@@ -15,7 +15,7 @@ from gsopt.data.scene import Scene, View
 from gsopt.errors import InputError, NumericalError
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
-from gsopt.metrics import psnr
+from gsopt.metrics import capped_psnr
 from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, Gradients, RasterSettings, RenderedFrame
 from gsopt.sds import coverage, policies, schedule
@@ -208,7 +208,7 @@ class Guide:
         _, seen = self._see(truth.cameras, background, gaussians, settings)
         answer = self._answer(step, 0, seen)
         before, after = (
-            psnr(images.clamp(0, 1).permute(0, 2, 3, 1), truth.images.permute(0, 2, 3, 1)).clamp(max=MOST_PSNR)
+            capped_psnr(images.clamp(0, 1).permute(0, 2, 3, 1), truth.images.permute(0, 2, 3, 1), MOST_PSNR)
             for images in (seen.images, answer)
         )
         return float(after - before)

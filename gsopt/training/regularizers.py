@@ -1,4 +1,4 @@
-"""Gradients of the terms beside the photometric loss, in closed form (their values: gsopt/losses.py)."""
+"""Gradients of the terms beside the photometric loss, in closed form (values: tests/training/test_regularizers.py)."""
 
 from __future__ import annotations
 

@@ -14,8 +14,6 @@ from gsopt.data.scene import View
 from gsopt.geometry.cameras import Cameras
 from gsopt.training.window import content_window
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-
 
 @dataclass(frozen=True)
 class Target:

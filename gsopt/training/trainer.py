@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.config.train import TrainConfig
+from gsopt.config.train import BACKGROUNDS, TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
@@ -26,7 +26,7 @@ from gsopt.training.order import ViewOrder, generators
 from gsopt.training.poses import PoseRefinement
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
 from gsopt.training.skipping import Bands, Resting
-from gsopt.training.targets import BACKGROUNDS, Target, Targets, content_pixels
+from gsopt.training.targets import Target, Targets, content_pixels
 from gsopt.training.window import draws_whole
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from PIL import Image
 
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
-from gsopt.metrics import VGG_VARIABLE
+from gsopt.metrics import PSNR_CAP, VGG_VARIABLE
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.results import evaluation
-from gsopt.results.evaluation import PSNR_CAP, evaluate, evaluate_views
+from gsopt.results.evaluation import evaluate, evaluate_views
 from gsopt.results.finished_run import truth
 
 

@@ -13,7 +13,7 @@ from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
 from gsopt.llm_prompts.schema import Prompt
-from gsopt.metrics import psnr
+from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
 from gsopt.sds.candidate_views import square_views
 from gsopt.sds.conditioning import Conditioning, encode
@@ -94,7 +94,7 @@ def compare_prompts(
             truths += [truth] if len(truths) < len(lefts) else []
             scores += [] if known is None else [p.score for p in known.prompts if p.score is not None]
         psnrs = tuple(
-            min(100.0, float(psnr(picture[None], truth[None]))) for picture, truth in zip(drawn, truths, strict=True)
+            float(capped_psnr(picture[None], truth[None])) for picture, truth in zip(drawn, truths, strict=True)
         )
         outcomes.append(Outcome(arm, psnrs, tuple(drawn), sum(scores) / len(scores) if scores else None))
         say(f"{arm.name}: {outcomes[-1].mean:.2f} dB on {len(lefts)} left-out views")

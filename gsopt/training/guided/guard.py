@@ -27,7 +27,7 @@ from gsopt.data.split import farthest_points
 from gsopt.errors import NumericalError
 from gsopt.geometry.cameras import Cameras
 from gsopt.init import first_gaussians
-from gsopt.metrics import psnr
+from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
 from gsopt.sds import schedule as sds_schedule
 from gsopt.sds.conditioning import Conditioning
@@ -189,4 +189,4 @@ def _trained(config: TrainConfig, left: Left, backend: Backend, guide: Aid | Non
 def _psnr(config: TrainConfig, left: Left, backend: Backend, guide: Aid | None) -> float:
     """Of the left-out view after a short run on the others, dB."""
     colors, truth = short_run(config, left, backend, guide)
-    return min(100.0, float(psnr(colors[None], truth[None])))
+    return float(capped_psnr(colors[None], truth[None]))

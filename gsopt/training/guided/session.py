@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from gsopt.config.train import TrainConfig
+from gsopt.config.train import BACKGROUNDS, TrainConfig
 from gsopt.data.files import is_regular
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError, UsageError
@@ -27,7 +27,6 @@ from gsopt.sds.candidate_views import square_views
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.guidance_step import Guide, Warn
 from gsopt.sds.priors.protocol import Images, Prior
-from gsopt.training.targets import BACKGROUNDS
 
 FOLDER, CONDITIONING = "guidance", "conditioning.safetensors"
 EMBEDDED_INPUTS = 8
