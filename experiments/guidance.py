@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.machine import machine
+from gsopt.benchmark.markdown import replace_block, table
 from gsopt.cli import main as gsopt
 from gsopt.events import to_json, write_atomic
 

@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from gsopt.benchmark import schema
-from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.machine import machine
+from gsopt.benchmark.markdown import replace_block, table
 from gsopt.benchmark.stopwatch import read, spread
 from gsopt.config.train import OptimizerConfig, TrainConfig
 from gsopt.data.scene import Scene, load_scene

@@ -27,8 +27,8 @@ import torch
 from guidance import scenes
 from torch import Tensor
 
-from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.machine import machine
+from gsopt.benchmark.markdown import replace_block, table
 from gsopt.cli import main as gsopt
 from gsopt.events import to_json, write_atomic
 from gsopt.geometry.cameras import Cameras

@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from gsopt.benchmark.suite.arm_flags import PLAIN
+from gsopt.benchmark.suite.arm_flags import PUBLISHED_SETTINGS
 
 RESULTS = Path(__file__).parent / "results" / "scenes.json"
 DEMO, LEGO, FOX = "gsopt/demo", "nerf_synthetic_lego_400", "fox"
@@ -29,7 +29,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "lego-100": (LEGO, []),
     "lego-100-30k": (LEGO, ["--iterations", "30000"]),
     "lego-8": (LEGO, EIGHT),
-    "lego-8-plain-3dgs": (LEGO, [*EIGHT, *PLAIN]),
+    "lego-8-plain-3dgs": (LEGO, [*EIGHT, *PUBLISHED_SETTINGS]),
     "fox-quarter": (FOX, ["-r", "4", "--eval"]),
     "fox-quarter-8": (FOX, ["-r", "4", "--eval", "--views", "8"]),
 }

@@ -18,8 +18,8 @@ sys.path.insert(0, str(ROOT / "tests" / "sds"))
 
 from real_memory import account  # noqa: E402
 
-from gsopt.benchmark.document import replace_block, table  # noqa: E402
 from gsopt.benchmark.machine import machine  # noqa: E402
+from gsopt.benchmark.markdown import replace_block, table  # noqa: E402
 from gsopt.events import to_json, write_atomic  # noqa: E402
 
 RESULT = ROOT / "experiments" / "results" / "sd21.json"

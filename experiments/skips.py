@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark import schema
-from gsopt.benchmark.document import replace_block, table
 from gsopt.benchmark.machine import machine
+from gsopt.benchmark.markdown import replace_block, table
 from gsopt.events import to_json, write_atomic
 
 ROOT = Path(__file__).resolve().parents[1]

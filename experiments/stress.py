@@ -19,8 +19,8 @@ from stress_measure import Deviation, Truth, deviation  # noqa: E402
 
 from gsopt.benchmark import schema  # noqa: E402
 from gsopt.benchmark.accuracy import compiled  # noqa: E402
-from gsopt.benchmark.document import replace_block, table  # noqa: E402
 from gsopt.benchmark.machine import machine  # noqa: E402
+from gsopt.benchmark.markdown import replace_block, table  # noqa: E402
 from gsopt.events import to_json, write_atomic  # noqa: E402
 
 RESULT = ROOT / "experiments" / "results" / "stress.json"

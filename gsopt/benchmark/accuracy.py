@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gsopt.benchmark.stopwatch import repeat, spread
-from gsopt.benchmark.surface import surface_scene
+from gsopt.benchmark.surface_scene import surface_scene
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import make_backend
@@ -28,32 +28,32 @@ from gsopt.raster.backend import (
 from gsopt.raster.cpu_backend import ISA_VARIABLE
 from gsopt.raster.reference import hard_threshold, raw_alphas, splat, transmittances
 
-SIDE, COUNT = 64, 2_000
-MARGIN = 1e-4
+IMAGE_SIDE, GAUSSIAN_COUNT = 64, 2_000
+TIE_MARGIN = 1e-4
 """Pixels where the threshold at 1/255, the clamp at 0.99 or the stop at T = 1e-4 lies within this (relative) are left
 out: float32 may decide differently there, which says nothing about its arithmetic."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class Rendering:
     """An image, and the gradients of a fixed weighted sum of its values."""
 
     colors: Tensor
     gradients: Gradients
 
 
-def accuracy(count: int = COUNT, side: int = SIDE, repetitions: int = 3) -> dict[str, Any]:
+def accuracy(count: int = GAUSSIAN_COUNT, side: int = IMAGE_SIDE, repetitions: int = 3) -> dict[str, Any]:
     """Time of forward + backward and error of every backend (`schema.ACCURACY`), the float64 reference first."""
     gaussians, camera = surface_scene(count, side, side)
     exact = gaussians.to(torch.float64)
     decided = decided_pixels(exact, camera)
     weights = torch.randn(side, side, 3, generator=torch.Generator().manual_seed(2)) * decided[..., None]
     reference = make_backend("reference")
-    truth = draw(reference, exact, camera, weights)
+    truth = rendered(reference, exact, camera, weights)
 
     def row(name: str, backend: Backend, model: Gaussians, times: int) -> dict[str, Any]:
-        got = draw(backend, model, camera, weights)
-        readings = repeat(lambda: draw(backend, model, camera, weights), times, warm_up=1)
+        got = rendered(backend, model, camera, weights)
+        readings = repeat(lambda: rendered(backend, model, camera, weights), times, warm_up=1)
         return {
             "backend": name,
             "ms": spread([reading.cpu for reading in readings]),
@@ -69,14 +69,18 @@ def accuracy(count: int = COUNT, side: int = SIDE, repetitions: int = 3) -> dict
 
 
 def decided_pixels(gaussians: Gaussians, camera: Cameras) -> Bool[Tensor, "H W"]:
-    """Where no decision of the image model stands within `MARGIN` of tipping."""
+    """Where no decision of the image model stands within `TIE_MARGIN` of tipping."""
     nothing = gaussians.means.new_zeros(len(gaussians), 2)
     splats = splat(gaussians, camera.to(gaussians.means.dtype), RasterSettings(), nothing)
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     deltas = torch.stack([x, y], dim=-1).view(-1, 1, 2) - splats.means2d
     raw = raw_alphas(deltas, splats.conics, splats.opacities)
     before, _ = transmittances(hard_threshold(raw))
-    lines = [(raw, ALPHA_MIN, MARGIN), (raw, ALPHA_MAX, MARGIN), (before, TRANSMITTANCE_MIN, 10 * MARGIN)]
+    lines = [
+        (raw, ALPHA_MIN, TIE_MARGIN),
+        (raw, ALPHA_MAX, TIE_MARGIN),
+        (before, TRANSMITTANCE_MIN, 10 * TIE_MARGIN),
+    ]
     tips = [((values / line - 1).abs() < margin).any(dim=1) for values, line, margin in lines]
     return ~torch.stack(tips).any(dim=0).view(camera.height, camera.width)
 
@@ -105,9 +109,9 @@ def instruction_set(isa: str) -> Iterator[None]:
             os.environ[ISA_VARIABLE] = before
 
 
-def draw(backend: Backend, gaussians: Gaussians, camera: Cameras, weights: Tensor) -> Drawn:
+def rendered(backend: Backend, gaussians: Gaussians, camera: Cameras, weights: Tensor) -> Rendering:
     frame = backend.forward(gaussians, camera, RasterSettings())
-    return Drawn(frame.colors, backend.backward(frame, weights.to(frame.colors)))
+    return Rendering(frame.colors, backend.backward(frame, weights.to(frame.colors)))
 
 
 def relative_error(got: Gradients, truth: Gradients, name: str) -> float:

@@ -16,26 +16,26 @@ SIDES = (64, 128, 256, 512, 1024, 2048)
 FIXED_SIDE, FIXED_COUNT = 800, 100_000
 
 
-def by_count(counts: Sequence[int] = COUNTS, tell: Callable[[str], None] = print) -> dict[str, Any]:
+def by_count(counts: Sequence[int] = COUNTS, report: Callable[[str], None] = print) -> dict[str, Any]:
     """Iterations at 800 x 800 with more and more Gaussians, ever smaller: the surface stays the same."""
     cases = [Case(f"{FIXED_SIDE}x{FIXED_SIDE}/{count}", FIXED_SIDE, FIXED_SIDE, count) for count in counts]
     fixed = f"{FIXED_SIDE}x{FIXED_SIDE} pixels, 1 thread"
-    return series("Gaussians", fixed, [(case.count, case) for case in cases], tell)
+    return series("Gaussians", fixed, [(case.count, case) for case in cases], report)
 
 
-def by_pixels(sides: Sequence[int] = SIDES, tell: Callable[[str], None] = print) -> dict[str, Any]:
+def by_pixels(sides: Sequence[int] = SIDES, report: Callable[[str], None] = print) -> dict[str, Any]:
     """Iterations over the same 100,000 Gaussians at growing resolution."""
     cases = [Case(f"{side}x{side}/{FIXED_COUNT}", side, side, FIXED_COUNT) for side in sides]
-    return series("pixels", f"{FIXED_COUNT:,} Gaussians, 1 thread", [(case.width**2, case) for case in cases], tell)
+    return series("pixels", f"{FIXED_COUNT:,} Gaussians, 1 thread", [(case.width**2, case) for case in cases], report)
 
 
-def series(what: str, fixed: str, cases: Sequence[tuple[int, Case]], tell: Callable[[str], None]) -> dict[str, Any]:
+def series(what: str, fixed: str, cases: Sequence[tuple[int, Case]], report: Callable[[str], None]) -> dict[str, Any]:
     """One record (`schema.GROWTH`). The exponent is that of the upper half, where fixed costs no longer show."""
     measure(cases[0][1])  # the first one pays for memory that the process keeps
     points = []
     for size, case in cases:
         points.append({"size": size, **measure(case)})
-        tell(f"{what} {size:,}: {points[-1]['cpu_ms']['median']:.1f} ms")
+        report(f"{what} {size:,}: {points[-1]['cpu_ms']['median']:.1f} ms")
     upper = points[len(points) // 2 :] if len(points) > 3 else points
     exponent = fitted_exponent([(p["size"], p["cpu_ms"]["median"]) for p in upper])
     return {"what": what, "fixed": fixed, "points": points, "exponent": exponent, "from_size": upper[0]["size"]}

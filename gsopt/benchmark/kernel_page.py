@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark.charts import Axis, Series, chart
-from gsopt.benchmark.document import replace_block, table
+from gsopt.benchmark.markdown import replace_block, table
 from gsopt.events import write_atomic
 
 STAGES = ("project", "bin", "blend", "photometric", "blend_backward", "project_backward", "adam")

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsopt import check
 from gsopt.benchmark.stopwatch import Reading, both, repeat
-from gsopt.benchmark.surface import surface_scene
+from gsopt.benchmark.surface_scene import surface_scene
 from gsopt.config.train import OptimizerConfig
 from gsopt.errors import UsageError
 from gsopt.geometry.cameras import Cameras
@@ -25,7 +25,7 @@ from gsopt.raster.cpu_backend import CpuBackend
 from gsopt.training.optimizer import Model, adam_step, learning_rates
 
 CASES = ("200x200/20k", "400x400/50k", "800x800/100k", "800x800/300k")
-NAME = re.compile(r"(\d+)x(\d+)/(\d+)(k|M|)")
+CASE_PATTERN = re.compile(r"(\d+)x(\d+)/(\d+)(k|M|)")
 UNITS = {"": 1, "k": 1_000, "M": 1_000_000}
 LAMBDA_DSSIM = 0.2
 # What a pixel and a splat cost at least beside one exponential, in fused multiply-adds (or other operations of the
@@ -46,7 +46,7 @@ class Case:
     @staticmethod
     def parse(name: str) -> Case:
         """From "800x800/100k"; UsageError for anything else."""
-        match = NAME.fullmatch(name)
+        match = CASE_PATTERN.fullmatch(name)
         if match is None:
             raise UsageError(f"`--case` must be WIDTHxHEIGHT/COUNT, got {name!r}. Try one of {', '.join(CASES)}.")
         case = Case(name, int(match[1]), int(match[2]), int(match[3]) * UNITS[match[4]])
@@ -78,15 +78,15 @@ class Iteration:
         # Rates so small that the scene is the same for the first and for the last repetition.
         self.rates = {name: 1e-7 * rate for name, rate in learning_rates(self.config, 1e-4).items()}
         self.target = blurred_noise(self.camera)
-        self.spent: Gradients | None = None
+        self.gradients: Gradients | None = None
         """Of the last iteration, written over by the next one, as the trainer does."""
 
     def run(self) -> None:
         """One full iteration."""
         frame = self.backend.forward(self.model.gaussians, self.camera, self.settings)
         loss = self.backend.photometric(frame.colors, self.target, LAMBDA_DSSIM)
-        self.spent = self.backend.backward(frame, loss.v_colors, bands=False, into=self.spent)
-        adam_step(self.model, self.spent, self.rates, self.config, self.backend, self.camera, self.settings)
+        self.gradients = self.backend.backward(frame, loss.v_colors, bands=False, into=self.gradients)
+        adam_step(self.model, self.gradients, self.rates, self.config, self.backend, self.camera, self.settings)
 
     def render(self) -> None:
         """The picture alone."""

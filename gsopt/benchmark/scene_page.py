@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark.charts import Axis, Series, chart
-from gsopt.benchmark.document import replace_block, table
-from gsopt.benchmark.scenes import front
+from gsopt.benchmark.markdown import replace_block, table
+from gsopt.benchmark.scenes import pareto_front
 from gsopt.config.presets import PRESETS
 from gsopt.events import write_atomic
 
@@ -28,7 +28,7 @@ def scenes(result: dict[str, Any]) -> list[str]:
     return list(dict.fromkeys(run["scene"] for run in result["runs"]))
 
 
-def of(result: dict[str, Any], scene: str, kind: str) -> list[dict[str, Any]]:
+def runs_of(result: dict[str, Any], scene: str, kind: str) -> list[dict[str, Any]]:
     """A scene's runs of one kind: presets from draft to high, the grid by budget and length."""
     found = [run for run in result["runs"] if run["scene"] == scene and run["kind"] == kind]
     order = list(PRESETS)
@@ -41,7 +41,7 @@ def charts(result: dict[str, Any], scene: str) -> dict[str, str]:
     for key, (word, label) in METRICS.items():
         curves = [
             Series(run["preset"], [(p["cpu_seconds"], p[key]) for p in run["points"] if p[key] is not None])
-            for run in of(result, scene, "curve")
+            for run in runs_of(result, scene, "curve")
         ]
         drawn[f"presets-{scene}-{word.lower()}"] = chart(f"{scene}: {word} over time", x, Axis(label), curves)
     drawn[f"pareto-{scene}"] = pareto_chart(result, scene)
@@ -51,11 +51,11 @@ def charts(result: dict[str, Any], scene: str) -> dict[str, str]:
 def pareto_chart(result: dict[str, Any], scene: str) -> str:
     """PSNR over time at the end of every run of the grid, one series per budget, and what no other run beats."""
     series: dict[int, list[tuple[float, float]]] = {}
-    for run in of(result, scene, "grid"):
+    for run in runs_of(result, scene, "grid"):
         last = run["points"][-1]
         series.setdefault(run["max_gaussians"] or 0, []).append((last["cpu_seconds"], last["psnr"]))
     lines = [Series(f"N = {count:,}", points) for count, points in series.items()]
-    best = front([point for points in series.values() for point in points])
+    best = pareto_front([point for points in series.values() for point in points])
     return chart(
         f"{scene}: budgets and lengths", Axis(SECONDS, True), Axis("PSNR, dB"), [*lines, Series("front", best)]
     )
@@ -65,10 +65,10 @@ def page_parts(result: dict[str, Any]) -> list[str]:
     machine = result["machine"]
     parts = [f"`{result['command']}` on {machine['cpu']}; gsopt {machine['commit'] or machine['gsopt']}."]
     for scene in scenes(result):
-        if curves := of(result, scene, "curve"):
+        if curves := runs_of(result, scene, "curve"):
             names = [f"presets-{scene}-{word.lower()}" for word, _ in METRICS.values()]
             parts += [preset_table(scene, curves), pictures(names)]
-        if grid := of(result, scene, "grid"):
+        if grid := runs_of(result, scene, "grid"):
             parts += [front_table(scene, grid), pictures([f"pareto-{scene}"])]
     return parts
 
@@ -85,7 +85,7 @@ def preset_table(scene: str, runs: list[dict[str, Any]]) -> str:
 def front_table(scene: str, runs: list[dict[str, Any]]) -> str:
     """Every run of the grid; those on the front in bold."""
     ends = [(run["points"][-1]["cpu_seconds"], run["points"][-1]["psnr"]) for run in runs]
-    best = set(front(ends))
+    best = set(pareto_front(ends))
     rows = []
     for run, end in zip(runs, ends, strict=True):
         budget = f"{run['max_gaussians'] or 0:,}"

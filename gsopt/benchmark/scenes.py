@@ -22,9 +22,9 @@ from gsopt.raster.backend import RasterSettings
 from gsopt.results.evaluation import evaluate_views
 from gsopt.training.loop import TrainResult, train
 
-LOOKS = 8
+EVALUATIONS = 8
 """How often a preset is judged on its way."""
-MOST_VIEWS = 16
+MAX_EVALUATED_VIEWS = 16
 """Held-out views that are judged, evenly spread."""
 
 Event = Mapping[str, Any]
@@ -54,9 +54,9 @@ class Task:
         )
         if self.iterations is not None:
             config = config.with_steps(self.iterations)
-        looks = max(1, config.iterations // LOOKS) if self.kind == "curve" else 0
+        every = max(1, config.iterations // EVALUATIONS) if self.kind == "curve" else 0
         density = DensityConfig(max_gaussians=self.max_gaussians)
-        return replace(config, density=density, preview_every=looks, checkpoint_every=0)
+        return replace(config, density=density, preview_every=every, checkpoint_every=0)
 
     def key(self) -> tuple[Any, ...]:
         """What makes two records records of the same run."""
@@ -69,13 +69,13 @@ def measure(task: Task) -> dict[str, Any]:
     events: list[Event] = []
     with tempfile.TemporaryDirectory() as folder:
         result = train(task.config(), Path(folder) / "run", on_progress=events.append)
-        judge = Judge(task, result)
+        evaluator = Evaluator(task, result)
         points = [
-            judge.point(load_splats(result.run / event["path"]), event["step"], *time_at(event["step"], events))
+            evaluator.point(load_splats(result.run / event["path"]), event["step"], *time_at(event["step"], events))
             for event in events
             if event["kind"] == "preview" and event["step"] < result.steps
         ]
-    points.append(judge.point(result.gaussians, result.steps, result.cpu_seconds, result.train_seconds))
+    points.append(evaluator.point(result.gaussians, result.steps, result.cpu_seconds, result.train_seconds))
     return {
         "scene": task.scene,
         "kind": task.kind,
@@ -86,14 +86,14 @@ def measure(task: Task) -> dict[str, Any]:
     }
 
 
-class Judge:
+class Evaluator:
     """Draws the held-out views of one run's scene and compares."""
 
     def __init__(self, task: Task, result: TrainResult) -> None:
         views = result.scene.test
         if not views:
             raise UsageError(f"{task.data.path} holds out no views, so nothing can be judged. Add --eval.")
-        count = min(MOST_VIEWS, len(views))
+        count = min(MAX_EVALUATED_VIEWS, len(views))
         self._views = [views[i * len(views) // count] for i in range(count)]
         self._backend = make_backend("auto", 1)
         self._background = torch.tensor(task.data.evaluation_background)
@@ -101,10 +101,9 @@ class Judge:
     @torch.no_grad()
     def point(self, gaussians: Gaussians, step: int, cpu: float, wall: float) -> dict[str, Any]:
         """One point of a curve (`schema.QUALITY`)."""
-        judged = evaluate_views(
-            gaussians, self._views, self._backend, RasterSettings(), self._background, None, vgg=False
-        )
-        mean = {name: judged["mean"][name] for name in ("psnr", "ssim", "lpips_alex")}
+        settings = RasterSettings()
+        found = evaluate_views(gaussians, self._views, self._backend, settings, self._background, None, vgg=False)
+        mean = {name: found["mean"][name] for name in ("psnr", "ssim", "lpips_alex")}
         times = {"cpu_seconds": round(cpu, 3), "wall_seconds": round(wall, 3)}
         return {"step": step, **times, "gaussians": len(gaussians), **mean}
 
@@ -119,7 +118,7 @@ def time_at(step: int, events: Sequence[Event]) -> tuple[float, float]:
     return told[-1][1:]
 
 
-def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """The Pareto front of (cost, quality): those points that none beats in both, by rising cost."""
     best, kept = float("-inf"), []
     for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):

@@ -120,20 +120,20 @@ def kernels(flags: Kernels, argv: Sequence[str]) -> int:
 
     import torch
 
-    from gsopt.benchmark import results
+    from gsopt.benchmark import result_files
     from gsopt.benchmark.kernels import Case
     from gsopt.benchmark.machine import calibration, machine
 
     cases = [Case.parse(name) for name in flags.case]
     if flags.json.exists():
-        results.read(flags.json)  # refused now rather than after minutes of measuring
+        result_files.read(flags.json)  # refused now rather than after minutes of measuring
     torch.set_num_threads(1)  # only the kernels' own threads may run
     command = "gsopt bench " + shlex.join(argv)
     measured: dict[str, Any] = {"command": command, "machine": machine(), "calibration": calibration()}
     measured |= {
         part: measure(part, cases, threads, flags.repetitions, measured["calibration"]) for part in flags.parts
     }
-    results.update(flags.json, measured)
+    result_files.update(flags.json, measured)
     print(f"Written: {flags.json}")
     return 0
 
@@ -175,12 +175,12 @@ def scenes(flags: Scenes, argv: Sequence[str]) -> int:
     """`gsopt bench scenes`."""
     check.at_least("--resolution", flags.resolution, 1, "1 keeps the size, 2 halves it, and so on.")
 
-    from gsopt.benchmark import results, schema
+    from gsopt.benchmark import result_files, schema
     from gsopt.benchmark import scenes as runs
     from gsopt.benchmark.machine import machine
 
     known = (
-        {results.run_key(run) for run in results.read(flags.json, schema.SCENES)["runs"]}
+        {result_files.run_key(run) for run in result_files.read(flags.json, schema.SCENES)["runs"]}
         if flags.json.exists()
         else set()
     )
@@ -189,7 +189,7 @@ def scenes(flags: Scenes, argv: Sequence[str]) -> int:
         if flags.missing and task.key() in known:
             continue
         record = runs.measure(task)
-        results.update_runs(flags.json, command, machine(), record)
+        result_files.update_runs(flags.json, command, machine(), record)
         print(run_line(record), flush=True)
     print(f"Written: {flags.json}")
     return 0
@@ -231,21 +231,21 @@ def suite(flags: Suite) -> int:
     from gsopt.benchmark.suite import definition as declared
 
     whole = declared.load(flags.suite)
-    part = declared.chosen(whole, flags.groups)
+    part = declared.with_groups(whole, flags.groups)
     cases = list(declared.cases(part, flags.seeds, flags.arms))
     root = declared.find_root(part, flags.root)
 
     from gsopt.benchmark.suite import result_file
     from gsopt.benchmark.suite.html_page import write_html
     from gsopt.benchmark.suite.runner import run_suite, work_folder
-    from gsopt.benchmark.suite.single_run import Bench
+    from gsopt.benchmark.suite.single_run import SuiteContext
 
     output = flags.output.absolute()
     folder = Path(flags.prior or "").expanduser()  # a run starts in another folder; any other name is an id
     prior = str(folder.absolute()) if flags.prior and folder.is_dir() else flags.prior
-    bench = Bench(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
+    options = SuiteContext(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
     command = suite_command(flags)
-    failed = run_suite(output, whole.name, command, cases, bench, lambda text: print(text, flush=True))
+    failed = run_suite(output, whole.name, command, cases, options, lambda text: print(text, flush=True))
     drawn = output.with_suffix(".html")
     write_html(result_file.read(output), result_file.read_pictures(output), drawn)
     print(f"Written: {output}, {drawn}")
@@ -263,15 +263,15 @@ def suite_command(flags: Suite) -> str:
 
 def draw(flags: Draw) -> int:
     """`gsopt bench draw`."""
-    from gsopt.benchmark import kernel_page, results, scene_page, schema
+    from gsopt.benchmark import kernel_page, result_files, scene_page, schema
 
-    document = results.parsed(flags.json)
+    document = result_files.parsed(flags.json)
     if "suite" in document:
         draw_suite(flags)
     elif "runs" in document:
-        scene_page.write_page(results.read(flags.json, schema.SCENES), flags.page)
+        scene_page.write_page(result_files.read(flags.json, schema.SCENES), flags.page)
     else:
-        kernel_page.write_page(results.read(flags.json), flags.page)
+        kernel_page.write_page(result_files.read(flags.json), flags.page)
     print(f"Written: {flags.page}")
     return 0
 

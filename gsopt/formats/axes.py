@@ -24,7 +24,7 @@ _ODD_IN = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "
 """The axes in which Y_1 .. Y_15 are odd."""
 
 
-def turned(gaussians: Gaussians, signs: Signs) -> Gaussians:
+def with_flipped_axes(gaussians: Gaussians, signs: Signs) -> Gaussians:
     """The same splats after the axes with sign -1 were turned around; its own inverse. A proper rotation needs two."""
     x, y, z = signs
     sign = {"x": x, "y": y, "z": z}

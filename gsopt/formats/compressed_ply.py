@@ -23,7 +23,7 @@ from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply import read_splats
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import float_blocks, raw_blocks, seek_element
-from gsopt.formats.rows import BYTE_OPACITY_MARGIN, checked, logit, storable
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN, checked, logit, storable
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.morton import morton_order

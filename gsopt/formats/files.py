@@ -39,10 +39,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         remedy = _REMEDIES.get(error.errno or 0, "Free some space or choose another folder.")
         raise InputError(f"Cannot write {path}: {error.strerror or error}. {remedy}") from error
     finally:
-        _forget(temporary)
+        _remove(temporary)
 
 
-def _forget(temporary: Path) -> None:
+def _remove(temporary: Path) -> None:
     try:
         temporary.unlink(missing_ok=True)
     except OSError:

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from gsopt._version import __version__
 from gsopt.errors import InputError
-from gsopt.formats.axes import LEFT_UP_FORWARD, turned
+from gsopt.formats.axes import LEFT_UP_FORWARD, with_flipped_axes
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Document, read_container
 from gsopt.formats.glb_splats import EXTENSION, Accessor, splat_primitives
-from gsopt.formats.rows import MAX_SH_DEGREE, checked, log_scales, logit, scales, storable, to_bytes
+from gsopt.formats.validation import MAX_SH_DEGREE, checked, log_scales, logit, scales, storable, to_bytes
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.quats import normalize
@@ -42,7 +42,7 @@ def save_glb(path: Path, gaussians: Gaussians) -> None:
     """
     if len(gaussians) == 0:
         raise InputError(f"{path}: a .glb must hold at least one splat, got 0. Use .ply.")
-    gaussians = turned(storable(gaussians, path), LEFT_UP_FORWARD)
+    gaussians = with_flipped_axes(storable(gaussians, path), LEFT_UP_FORWARD)
     attributes = list(_attributes(gaussians))
     text = json.dumps(_document(attributes, gaussians), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -122,7 +122,7 @@ def load_glb(path: Path) -> Gaussians:
     degree = max(part.sh_degree for part in parts)
     parts = [part.with_sh_degree(degree) for part in parts]
     joined = Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name, _ in parts[0].items()})
-    return checked(turned(joined, LEFT_UP_FORWARD), path)
+    return checked(with_flipped_axes(joined, LEFT_UP_FORWARD), path)
 
 
 def _read(file: BinaryIO, primitive: dict[str, Accessor], document: Document) -> Gaussians:

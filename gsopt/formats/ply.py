@@ -20,7 +20,7 @@ from gsopt.errors import InputError
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import BLOCK, float_blocks, seek_element
-from gsopt.formats.rows import BANDS, MAX_SH_DEGREE, checked, storable
+from gsopt.formats.validation import BANDS, MAX_SH_DEGREE, checked, storable
 from gsopt.gaussians import PARAMETERS, Gaussians
 
 _MEANS = ("x", "y", "z")

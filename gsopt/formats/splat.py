@@ -13,7 +13,7 @@ import torch
 
 from gsopt.errors import InputError
 from gsopt.formats.files import opened, read_exactly, replacing
-from gsopt.formats.rows import BYTE_OPACITY_MARGIN, checked, log_scales, logit, scales, storable, to_bytes
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN, checked, log_scales, logit, scales, storable, to_bytes
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.quats import normalize

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsopt.errors import InputError
-from gsopt.formats.axes import RIGHT_UP_BACK, turned
+from gsopt.formats.axes import RIGHT_UP_BACK, with_flipped_axes
+from gsopt.formats.compression import GzipStream, check_ratio, deflated, unzstd, zstandard_compressed
 from gsopt.formats.files import opened, read_exactly, replacing
-from gsopt.formats.inflate import GzipStream, check_ratio, deflated, unzstd, zstandard_compressed
-from gsopt.formats.rows import MAX_SH_DEGREE, checked, storable
 from gsopt.formats.spz_codes import pack, stream_sizes, unpack
+from gsopt.formats.validation import MAX_SH_DEGREE, checked, storable
 from gsopt.gaussians import Gaussians
 
 _MAGIC = b"NGSP"
@@ -57,7 +57,7 @@ def save_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False, ver
     """
     if version not in (3, 4):
         raise InputError(f"{path}: .spz version must be 3 or 4, got {version}. Leave it out for 3.")
-    gaussians = turned(storable(gaussians, path), RIGHT_UP_BACK)
+    gaussians = with_flipped_axes(storable(gaussians, path), RIGHT_UP_BACK)
     fraction_bits, streams = pack(gaussians, path)
     flags = _ANTIALIASED if antialiased else 0
     streams = [stream for stream in streams if stream]
@@ -83,7 +83,7 @@ def load_spz(path: Path) -> Gaussians:
         read = _read_gzip if _is_gzip(file, path) else _read_zstandard
         header, streams = read(file, size, path)
     gaussians = unpack(streams, header.count, header.sh_degree, header.version, header.fraction_bits)
-    return checked(turned(gaussians, RIGHT_UP_BACK), path)
+    return checked(with_flipped_axes(gaussians, RIGHT_UP_BACK), path)
 
 
 def spz_antialiased(path: Path) -> bool:

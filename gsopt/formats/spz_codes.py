@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsopt.errors import InputError
-from gsopt.formats.rows import BYTE_OPACITY_MARGIN, logit, to_bytes
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN, logit, to_bytes
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.quats import normalize
 

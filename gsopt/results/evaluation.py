@@ -55,7 +55,7 @@ def evaluate_views(
     per_view: list[dict[str, Any]] = []
     for index, view in enumerate(views):
         picture = draw(gaussians, view.camera, backend, settings, background)
-        row: dict[str, Any] = {"name": view.name, **_judge(picture, truth(view, background), networks)}
+        row: dict[str, Any] = {"name": view.name, **_image_metrics(picture, truth(view, background), networks)}
         if save_dir is not None:
             (path,) = save_stills(save_dir, [(safe_name(index, view.name), picture)], overwrite=True)
             row["render"] = path.name
@@ -70,7 +70,7 @@ def _networks(vgg: bool) -> dict[str, Lpips | None]:
     return {"lpips_alex": Lpips("alex"), "lpips_vgg": Lpips("vgg") if has_vgg else None}
 
 
-def _judge(
+def _image_metrics(
     picture: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], networks: dict[str, Lpips | None]
 ) -> dict[str, float | None]:
     a, b = (image[None].float() / 255 for image in (picture, target))
@@ -134,7 +134,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | None) -> dict[str, Any]:
     split, views = ("test", scene.test) if scene.test else ("train", _spread(scene.train, TRAIN_SAMPLE))
-    judged = evaluate_views(
+    evaluated = evaluate_views(
         finished.gaussians,
         views,
         finished.backend,
@@ -144,12 +144,12 @@ def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | N
         vgg=vgg,
         on_view=on_view,
     )
-    for row in judged["per_view"]:
+    for row in evaluated["per_view"]:
         row["render"] = f"renders/{split}/{row['render']}"
     notes = [VGG_NOTE] if vgg and find_vgg_weights() is None else []
     if split == "test":
-        return {**judged, "reason": None, "train": None, "notes": notes}
-    return {"mean": None, "per_view": [], "reason": NO_TEST_VIEWS, "train": judged, "notes": notes}
+        return {**evaluated, "reason": None, "train": None, "notes": notes}
+    return {"mean": None, "per_view": [], "reason": NO_TEST_VIEWS, "train": evaluated, "notes": notes}
 
 
 def _spread(views: Sequence[View], count: int) -> list[View]:
@@ -171,14 +171,14 @@ def _about(finished: FinishedRun) -> dict[str, Any]:
 
 def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> str:
     """How the figures came about, in words that can stand under a table."""
-    judged = len(results["per_view"]) or len(results["train"]["per_view"])
+    evaluated = len(results["per_view"]) or len(results["train"]["per_view"])
     background = {"random": "white (trained on random)"}.get(finished.config.data.background)
     return (
         "PSNR per image then mean; SSIM 11x11 sigma 1.5 zero padding; LPIPS v0.1 Alex and VGG, inputs mapped to [-1,1] "
         "(the Inria code feeds VGG [0,1] unscaled, which gives other values); renders and truths rounded to 8 bit as "
         f"the field does; equal images count as {PSNR_CAP:g} dB; background "
         f"{background or finished.config.data.background}; split: learned from {len(scene.train)} views, held out "
-        f"{len(scene.test)}, judged {judged} {'held-out' if scene.test else 'training'} views; images "
+        f"{len(scene.test)}, judged {evaluated} {'held-out' if scene.test else 'training'} views; images "
         f"{_sizes(scene.test or scene.train)}; gsopt {__version__}, torch {torch.__version__}, "
         f"backend {finished.backend.name}."
     )

@@ -20,9 +20,9 @@ from gsopt.geometry.camera_paths import ellipse_path, interpolated_path, orbit_p
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, RasterSettings
-from gsopt.results.video import safe_name, save_film, save_stills
+from gsopt.results.video import safe_name, save_stills, save_video
 
-Shot = tuple[str, Cameras]
+NamedCamera = tuple[str, Cameras]
 """A file name without suffix, and the one camera to draw it from."""
 
 
@@ -86,7 +86,7 @@ def to_bytes(colors: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
     return (colors.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
-def shots_along(run: FinishedRun, path: str, count: int, longest: int | None = None) -> list[Shot]:
+def cameras_along(run: FinishedRun, path: str, count: int, longest: int | None = None) -> list[NamedCamera]:
     """What to draw for `--path`: the input or held-out views themselves, or `count` cameras on a film's path.
 
     `longest`: scale so that the longer side has this many px. Raises InputError when nothing was held out.
@@ -101,20 +101,20 @@ def shots_along(run: FinishedRun, path: str, count: int, longest: int | None = N
         shots = [(safe_name(index, view.name), view.camera) for index, view in enumerate(views)]
     else:
         cameras = Cameras.cat([view.camera.resized(*_first_size(scene)) for view in scene.train])
-        film = film_path(run, cameras, path, count)
+        film = camera_path(run, cameras, path, count)
         shots = [(f"{index:04d}", film[index]) for index in range(len(film))]
-    return [(name, camera if longest is None else fitted(camera, longest)) for name, camera in shots]
+    return [(name, camera if longest is None else with_longest_side(camera, longest)) for name, camera in shots]
 
 
-def film_path(run: FinishedRun, cameras: Cameras, path: str, count: int) -> Cameras:
+def camera_path(run: FinishedRun, cameras: Cameras, path: str, count: int) -> Cameras:
     """`count` cameras on an orbit, a turntable, an ellipse or through the given cameras (interpolated)."""
     if path == "interpolated":
         return interpolated_path(cameras, count)
     make = {"orbit": orbit_path, "turntable": turntable_path, "ellipse": ellipse_path}[path]
-    return make(cameras, count, subject(run.gaussians, cameras))
+    return make(cameras, count, look_at_point(run.gaussians, cameras))
 
 
-def subject(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"] | None:
+def look_at_point(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"] | None:
     """Where a film should look when the cameras do not say: for one camera, the median of the more opaque half."""
     if len(cameras) > 1 or len(gaussians) == 0:
         return None
@@ -122,20 +122,22 @@ def subject(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"] | None
     return solid.median(dim=0).values
 
 
-def fitted(camera: Cameras, longest: int) -> Cameras:
+def with_longest_side(camera: Cameras, longest: int) -> Cameras:
     """The same camera with its longer side scaled to `longest` px."""
     scale = longest / max(camera.width, camera.height)
     return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
-def render_stills(run: FinishedRun, shots: list[Shot], folder: Path, *, overwrite: bool = False) -> None:
+def render_stills(run: FinishedRun, shots: list[NamedCamera], folder: Path, *, overwrite: bool = False) -> None:
     """PNG frames in a folder."""
     save_stills(folder, ((name, run.draw(camera)) for name, camera in shots), overwrite=overwrite)
 
 
-def render_film(run: FinishedRun, shots: list[Shot], output: Path, fps: float, *, overwrite: bool = False) -> None:
+def render_video(
+    run: FinishedRun, shots: list[NamedCamera], output: Path, fps: float, *, overwrite: bool = False
+) -> None:
     """A film; its format is the suffix of `output`."""
-    save_film(output, (run.draw(camera) for _, camera in shots), fps, overwrite=overwrite)
+    save_video(output, (run.draw(camera) for _, camera in shots), fps, overwrite=overwrite)
 
 
 def _first_size(scene: Scene) -> tuple[int, int]:

@@ -17,32 +17,34 @@ from gsopt._optional import require
 from gsopt.errors import InputError, UsageError
 from gsopt.formats.files import replacing
 
-FILMS = (".mp4", ".webp", ".gif")
+VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
 WEBP_QUALITY = 85
-LARGEST_SIDE = {".webp": 16383, ".gif": 65535, ".mp4": 8192}
+MAX_SIDE = {".webp": 16383, ".gif": 65535, ".mp4": 8192}
 """What the formats (WebP, GIF) or common decoders (H.264) can hold, px."""
 
 
-def save_film(output: Path, pictures: Iterable[UInt8[Tensor, "H W 3"]], fps: float, *, overwrite: bool = False) -> None:
+def save_video(
+    output: Path, pictures: Iterable[UInt8[Tensor, "H W 3"]], fps: float, *, overwrite: bool = False
+) -> None:
     """Write a film whose format the suffix of `output` names; whole file or nothing.
 
     Raises UsageError when the file exists and `overwrite` is not set, InputError for pictures of different sizes,
     MissingDependency when MP4 is asked for without the package `av`.
     """
     kind = output.suffix.lower()
-    check.one_of("suffix of --output", kind, FILMS)
+    check.one_of("suffix of --output", kind, VIDEO_SUFFIXES)
     check.within("--fps", fps, 0.1, 240, "24 is usual.")
     if output.exists() and not overwrite:
         raise UsageError(f"{output} exists already. Add --overwrite to replace it, or name another file.")
     if kind == ".mp4":
         require("av", "video", "Writing an MP4 film")
-    images = _same_size(pictures, LARGEST_SIDE[kind])
+    images = _same_size(pictures, MAX_SIDE[kind])
     first = next(images)
     with replacing(output) as file:
-        write_film(file, itertools.chain([first], images), kind, fps)
+        write_video(file, itertools.chain([first], images), kind, fps)
 
 
-def write_film(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: float) -> None:
+def write_video(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: float) -> None:
     """Encode images of one size into an open, seekable file."""
     if kind == ".mp4":
         _write_mp4(file, images, fps)

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from gsopt import cli
-from gsopt.benchmark import results, schema
+from gsopt.benchmark import result_files, schema
 from gsopt.benchmark.charts import Axis, Series, chart
-from gsopt.benchmark.document import replace_block
 from gsopt.benchmark.growth import fitted_exponent
 from gsopt.benchmark.kernels import Case, Iteration
+from gsopt.benchmark.markdown import replace_block
 from gsopt.benchmark.stopwatch import spread
-from gsopt.benchmark.surface import FLATNESS, surface_scene
+from gsopt.benchmark.surface_scene import FLATNESS, surface_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
@@ -46,13 +46,13 @@ def test_the_scene_is_wholly_in_view_flat_and_reproducible() -> None:
 
 
 def test_one_record_per_case_and_number_of_threads(measured: Path) -> None:
-    document = results.read(measured)
+    document = result_files.read(measured)
     assert [(record["case"], record["threads"]) for record in document["cases"]] == [(CASE, 1), (CASE, 2)]
     assert document["cases"][0]["useful_pairs"] == document["cases"][1]["useful_pairs"] > 0
 
 
 def test_the_stages_make_up_the_iteration(measured: Path) -> None:
-    record = results.read(measured)["cases"][0]
+    record = result_files.read(measured)["cases"][0]
     stages = sum(stage["wall_ms"]["median"] for stage in record["stages"].values())
     assert len(record["stages"]) == 7
     assert 0 < stages <= record["wall_ms"]["median"] + 3 * record["wall_ms"]["iqr"]
@@ -74,33 +74,33 @@ def test_useful_pairs_are_counted_as_the_image_model_says() -> None:
 
 
 def test_other_cases_are_kept_and_the_same_case_is_replaced(measured: Path, tmp_path: Path) -> None:
-    document = results.read(measured)
+    document = result_files.read(measured)
     file = tmp_path / "kernels.json"
     file.write_bytes(measured.read_bytes())
     changed = {**document["cases"][0], "repetitions": 99}
     other = {**document["cases"][0], "case": "8x8/1", "width": 8, "height": 8}
     base = {key: document[key] for key in ("command", "machine", "calibration")}
-    results.update(file, {**base, "cases": [changed, other]})
-    kept = results.read(file)["cases"]
+    result_files.update(file, {**base, "cases": [changed, other]})
+    kept = result_files.read(file)["cases"]
     assert [(r["case"], r["threads"], r["repetitions"]) for r in kept] == [("8x8/1", 1, 3), (CASE, 1, 99), (CASE, 2, 3)]
 
 
 def test_what_departs_from_the_schema_is_not_written(measured: Path, tmp_path: Path) -> None:
-    document = results.read(measured)
+    document = result_files.read(measured)
     file = tmp_path / "kernels.json"
     broken: dict[str, Any] = {**document, "cases": [{**document["cases"][0], "useful_pairs": "many"}]}
     with pytest.raises(InputError, match=r"`result.cases\[0\].useful_pairs` must be int, got 'many'"):
-        results.update(file, {key: value for key, value in broken.items() if key != "version"})
+        result_files.update(file, {key: value for key, value in broken.items() if key != "version"})
     assert not file.exists()
     with pytest.raises(InputError, match="must be float, got 'nan'"):
         schema.require({"median": float("nan"), "iqr": 0.0}, schema.SPREAD)
     file.write_text("{}")
     with pytest.raises(InputError, match="must be the keys"):
-        results.read(file)
+        result_files.read(file)
 
 
 def test_the_committed_results_keep_the_schema() -> None:
-    results.read(ROOT / "experiments" / "results" / "kernels.json")
+    result_files.read(ROOT / "experiments" / "results" / "kernels.json")
 
 
 def test_a_page_is_drawn_from_the_file_alone(measured: Path, tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt import cli
-from gsopt.benchmark import results, schema
-from gsopt.benchmark.scenes import Task, front, time_at
+from gsopt.benchmark import result_files, schema
+from gsopt.benchmark.scenes import Task, pareto_front, time_at
 from gsopt.cli import bench
 from gsopt.config.presets import PRESETS
 from gsopt.config.train import DataConfig
@@ -24,8 +24,8 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("scenes") / "runs.json"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "draft", {"iterations": 4})
-        patch.setattr("gsopt.benchmark.scenes.LOOKS", 2)
-        patch.setattr("gsopt.benchmark.scenes.MOST_VIEWS", 2)
+        patch.setattr("gsopt.benchmark.scenes.EVALUATIONS", 2)
+        patch.setattr("gsopt.benchmark.scenes.MAX_EVALUATED_VIEWS", 2)
         argv = ["bench", "scenes", "--json", str(file), "-r", "4", "--presets", "draft"]
         assert cli.main([*argv, "--counts", "300", "1k", "--lengths", "3"]) == 0
         assert cli.main([*argv, "--counts", "300", "--lengths", "3", "--missing"]) == 0
@@ -33,7 +33,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_preset_is_judged_on_its_way_and_the_grid_at_its_end(measured: Path) -> None:
-    runs = results.read(measured, schema.SCENES)["runs"]
+    runs = result_files.read(measured, schema.SCENES)["runs"]
     assert [(run["kind"], run["max_gaussians"], [p["step"] for p in run["points"]]) for run in runs] == [
         ("curve", None, [2, 4]),
         ("grid", 300, [3]),
@@ -49,9 +49,9 @@ def test_a_preset_is_judged_on_its_way_and_the_grid_at_its_end(measured: Path) -
 def test_another_measurement_of_the_same_run_replaces_it(measured: Path, tmp_path: Path) -> None:
     file = tmp_path / "runs.json"
     file.write_bytes(measured.read_bytes())
-    document = results.read(file, schema.SCENES)
-    results.update_runs(file, "again", document["machine"], {**document["runs"][1], "points": []})
-    runs = results.read(file, schema.SCENES)["runs"]
+    document = result_files.read(file, schema.SCENES)
+    result_files.update_runs(file, "again", document["machine"], {**document["runs"][1], "points": []})
+    runs = result_files.read(file, schema.SCENES)["runs"]
     assert len(runs) == 3
     assert runs[-1]["points"] == []
 
@@ -93,7 +93,7 @@ def test_a_task_with_a_length_or_a_budget_belongs_to_the_grid() -> None:
     assert one_view.iterations == 6000  # a point of the grid is as long as its record says
 
 
-def test_times_lie_between_what_was_told() -> None:
+def test_times_lie_between_two_events() -> None:
     events = [
         {"kind": "progress", "step": 10, "cpu_seconds": 1.0, "seconds": 2.0},
         {"kind": "preview", "step": 15},
@@ -107,7 +107,7 @@ def test_times_lie_between_what_was_told() -> None:
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 9), st.floats(0, 9)), min_size=1, max_size=12))
 def test_nothing_beats_a_point_of_the_front_and_something_beats_the_rest(points: list[tuple[float, float]]) -> None:
-    kept = front(points)
+    kept = pareto_front(points)
     for cost, quality in points:
         beaten = any(c <= cost and q >= quality and (c, q) != (cost, quality) for c, q in points)
         assert ((cost, quality) in kept) == (not beaten)

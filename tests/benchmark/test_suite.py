@@ -33,7 +33,7 @@ def document(*records: dict[str, Any], name: str = "sparse") -> dict[str, Any]:
 # Declarations
 
 
-@pytest.mark.parametrize("name", definition.SUITES)
+@pytest.mark.parametrize("name", definition.BUILT_IN_SUITES)
 def test_a_suite_declares_runs_that_differ_and_arms_that_exist(name: str) -> None:
     cases = list(definition.cases(definition.load(name), 2))
     assert len({case.id for case in cases}) == len(cases) > 0
@@ -59,9 +59,9 @@ def test_views_are_a_number_ids_or_all() -> None:
 
 def test_the_published_settings_are_defined_once() -> None:
     source = (ROOT / "experiments" / "scenes.py").read_text()
-    assert "import PLAIN" in source
+    assert "import PUBLISHED_SETTINGS" in source
     assert "1.25e-4" not in source
-    assert arm_flags.ARMS["3dgs"] == arm_flags.PLAIN
+    assert arm_flags.ARMS["3dgs"] == arm_flags.PUBLISHED_SETTINGS
 
 
 @pytest.mark.parametrize("text", ["", "groups = 3\ntitle='a'\nabout='b'", "title = ", "[[groups]]\nname = 'x'"])
@@ -169,7 +169,7 @@ def test_what_only_draws_exists() -> None:
 @pytest.mark.parametrize(("degrees", "t"), [(1, 12.7062), (2, 4.3027), (3, 3.1824), (10, 2.2281), (30, 2.0423)])
 def test_quantiles_of_students_t_are_those_of_printed_tables(degrees: int, t: float) -> None:
     assert aggregate.t_quantile(0.975, degrees) == pytest.approx(t, abs=5e-5)
-    assert aggregate.t_share(t, degrees) == pytest.approx(0.95, abs=1e-5)
+    assert aggregate.t_probability(t, degrees) == pytest.approx(0.95, abs=1e-5)
 
 
 def test_a_paired_interval_is_the_one_computed_by_hand() -> None:
@@ -203,9 +203,9 @@ def test_a_shift_of_all_values_shifts_the_mean_and_leaves_the_interval(values: l
 
 def test_seconds_to_a_quality_lie_on_the_course() -> None:
     course = [{"cpu_seconds": 10.0, "psnr": 20.0}, {"cpu_seconds": 30.0, "psnr": 24.0}]
-    assert [aggregate.seconds_to(course, psnr) for psnr in (19, 20, 21, 24, 25)] == [10, 10, 15, 30, None]
+    assert [aggregate.seconds_to_psnr(course, psnr) for psnr in (19, 20, 21, 24, 25)] == [10, 10, 15, 30, None]
     runs = [record("3dgs", 20), record("ours", 21), record("ours", 22, "b")]
-    assert aggregate.reached(runs, ("ours", 2000), ("3dgs", 2000)) == ([7.5], 1)
+    assert aggregate.times_to_match(runs, ("ours", 2000), ("3dgs", 2000)) == ([7.5], 1)
 
 
 def test_a_mean_course_leaves_out_looks_that_some_run_lacks() -> None:
@@ -300,7 +300,7 @@ def test_an_arm_that_lacks_scenes_does_not_narrow_the_others() -> None:
         record(arm, 20.0 + i, scene) for i, arm in enumerate(("3dgs", "ours-0")) for scene in ("objects/a", "objects/b")
     ]
     runs.append(record("ours-llm", 30.0, "objects/b"))
-    made = tables.part(definition.load("sparse"), definition.load("sparse").groups[0], "4", runs)
+    made = tables.group_section(definition.load("sparse"), definition.load("sparse").groups[0], "4", runs)
     note, (_, rows) = made.tables[0]
     assert [row[:3] for row in rows] == [["3dgs, 2,000", "2", "20.00"], ["ours-0, 2,000", "2", "21.00"]]
     assert "ours-llm" in note
@@ -350,6 +350,6 @@ def test_the_committed_results_keep_the_schema_and_name_no_folder(file: Path) ->
         assert all(html_page.decoded(value["error"]).size for value in pictures.values() if "error" in value)
         return
     made = result_file.read(file)
-    assert tables.parts(made)
+    assert tables.group_sections(made)
     assert file.stat().st_size < 1_000_000
     assert not re.search(r"\s/\w", made["command"])

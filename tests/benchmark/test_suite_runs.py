@@ -20,7 +20,7 @@ from suite_records import MACHINE, record
 
 from gsopt import cli
 from gsopt.benchmark.suite import definition, result_file, run_figures, run_key, runner, single_run
-from gsopt.benchmark.suite.single_run import Bench, RunFailed
+from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.data.scene import load_scene
 from gsopt.geometry import quats
 from gsopt.llm_prompts.schema import Prompt, PromptSet, write_set
@@ -42,13 +42,13 @@ class Killed(BaseException):
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
+def context(tmp_path: Path) -> SuiteContext:
     """Two scenes of one file each."""
     for name in ("a", "b"):
         (tmp_path / "root" / "objects" / name).mkdir(parents=True)
         (tmp_path / "root" / "objects" / name / "image.png").write_text(name)
     run_key.folder_hash.cache_clear()
-    return Bench(tmp_path / "root", tmp_path / "r-runs", 1)
+    return SuiteContext(tmp_path / "root", tmp_path / "r-runs", 1)
 
 
 @pytest.fixture
@@ -56,9 +56,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Ids of the runs made, in order: training is replaced by a record with the case's name in it."""
     ids: list[str] = []
 
-    def measure(case: definition.Case, bench: Bench) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    def measure(case: definition.Case, context: SuiteContext) -> tuple[dict[str, Any], str, dict[str, Any]]:
         ids.append(case.id)
-        named = {**record(case.arm, 20.0, case.scene, case.seed), "key": single_run.key(case, bench)}
+        named = {**record(case.arm, 20.0, case.scene, case.seed), "key": single_run.key(case, context)}
         return named, "protocol", {case.id: {"render": "r"}}
 
     monkeypatch.setattr(single_run, "measure", measure)
@@ -66,34 +66,34 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ids
 
 
-def go(tmp_path: Path, bench: Bench, cases: list[definition.Case] = CASES) -> list[str]:
+def go(tmp_path: Path, context: SuiteContext, cases: list[definition.Case] = CASES) -> list[str]:
     run_key.folder_hash.cache_clear()
-    return runner.run_suite(tmp_path / "r.json", "sparse", "c", cases, bench, lambda text: None)
+    return runner.run_suite(tmp_path / "r.json", "sparse", "c", cases, context, lambda text: None)
 
 
-def test_nothing_is_made_twice(tmp_path: Path, bench: Bench, made: list[str]) -> None:
-    go(tmp_path, bench, CASES[:2])
+def test_nothing_is_made_twice(tmp_path: Path, context: SuiteContext, made: list[str]) -> None:
+    go(tmp_path, context, CASES[:2])
     before = (tmp_path / "r.json").read_bytes()
-    go(tmp_path, bench, CASES[:2])
+    go(tmp_path, context, CASES[:2])
     assert (tmp_path / "r.json").read_bytes() == before
-    go(tmp_path, bench)
+    go(tmp_path, context)
     assert made == [case.id for case in CASES]
     assert set(result_file.read_pictures(tmp_path / "r.json")) == set(made)
 
 
 @pytest.mark.parametrize("what", ["settings", "data", "code"])
 def test_what_changed_is_made_again_and_replaces_its_record(
-    tmp_path: Path, bench: Bench, made: list[str], monkeypatch: pytest.MonkeyPatch, what: str
+    tmp_path: Path, context: SuiteContext, made: list[str], monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    go(tmp_path, bench)
+    go(tmp_path, context)
     cases = list(CASES)
     if what == "settings":
         cases[1] = replace(cases[1], flags=(*cases[1].flags, "--antialiased"))
     elif what == "data":
-        (bench.root / "objects" / "b" / "image.png").write_text("changed")
+        (context.root / "objects" / "b" / "image.png").write_text("changed")
     else:
         monkeypatch.setattr(run_key, "code_hash", lambda: "other")
-    go(tmp_path, bench, cases)
+    go(tmp_path, context, cases)
     again = {"settings": cases[1:2], "data": cases[2:], "code": cases}[what]
     assert made[4:] == [case.id for case in again]
     assert len(result_file.read(tmp_path / "r.json")["runs"]) == 4
@@ -102,7 +102,7 @@ def test_what_changed_is_made_again_and_replaces_its_record(
 @pytest.mark.parametrize("stage", ["measure", "write", "write_pictures", "replace"])
 @pytest.mark.parametrize("number", [0, 2])
 def test_a_kill_loses_at_most_the_run_being_made(
-    tmp_path: Path, bench: Bench, made: list[str], stage: str, number: int
+    tmp_path: Path, context: SuiteContext, made: list[str], stage: str, number: int
 ) -> None:
     """Killed in a run, before or while its record is written, before its pictures are."""
     owner: Any = {"measure": single_run, "write": result_file, "write_pictures": result_file, "replace": None}[stage]
@@ -112,15 +112,15 @@ def test_a_kill_loses_at_most_the_run_being_made(
         else:
             patch.setattr(owner, stage, after(number, getattr(owner, stage)))
         with pytest.raises(Killed):
-            go(tmp_path, bench)
+            go(tmp_path, context)
     kept = result_file.read(tmp_path / "r.json")["runs"] if number else []
     assert [result_file.run_id(run) for run in kept] == [case.id for case in CASES[:number]]
     done = len(made)
-    (bench.work / "run-killed").mkdir(parents=True, exist_ok=True)
-    go(tmp_path, bench)
+    (context.work / "run-killed").mkdir(parents=True, exist_ok=True)
+    go(tmp_path, context)
     assert made[done:] == [case.id for case in CASES[number:]]
     assert len(result_file.read(tmp_path / "r.json")["runs"]) == 4
-    assert not (bench.work / "run-killed").exists()
+    assert not (context.work / "run-killed").exists()
 
 
 def after(count: int, real: Callable[..., Any]) -> Callable[..., Any]:
@@ -136,36 +136,36 @@ def after(count: int, real: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def test_a_run_that_fails_is_told_and_the_others_are_made(
-    tmp_path: Path, bench: Bench, made: list[str], monkeypatch: pytest.MonkeyPatch
+def test_a_run_that_fails_is_reported_and_the_others_are_made(
+    tmp_path: Path, context: SuiteContext, made: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = single_run.measure
 
-    def measure(case: definition.Case, bench: Bench) -> Any:
+    def measure(case: definition.Case, context: SuiteContext) -> Any:
         if case is CASES[1]:
             raise RunFailed("`x` ended with exit code 4. Mend that.")
-        return real(case, bench)
+        return real(case, context)
 
     monkeypatch.setattr(single_run, "measure", measure)
-    assert go(tmp_path, bench) == [CASES[1].id]
+    assert go(tmp_path, context) == [CASES[1].id]
     assert len(made) == 3
     monkeypatch.setattr(single_run, "measure", real)
-    assert go(tmp_path, bench) == []
+    assert go(tmp_path, context) == []
     assert made[3:] == [CASES[1].id]
 
 
 def test_a_record_outlives_a_machine_that_cannot_make_it(
-    tmp_path: Path, bench: Bench, made: list[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, context: SuiteContext, made: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    go(tmp_path, bench)
+    go(tmp_path, context)
     before = (tmp_path / "r.json").read_bytes()
-    monkeypatch.setattr(single_run, "reason_to_skip", lambda case, bench: "no prior at hand")
-    go(tmp_path, bench)
+    monkeypatch.setattr(single_run, "reason_to_skip", lambda case, context: "no prior at hand")
+    go(tmp_path, context)
     assert (tmp_path / "r.json").read_bytes() == before
 
 
-def test_training_that_fails_says_why(tmp_path: Path, bench: Bench) -> None:
-    bench.work.mkdir()
+def test_training_that_fails_says_why(tmp_path: Path, context: SuiteContext) -> None:
+    context.work.mkdir()
     with pytest.raises(RunFailed, match=r"exit code 2: .*--iterations.*at least 1, got 0"):
         single_run.call(["train", "x", "-m", str(tmp_path / "run"), "--iterations", "0"], tmp_path / "log")
 
@@ -174,7 +174,7 @@ def test_training_that_fails_says_why(tmp_path: Path, bench: Bench) -> None:
 
 
 def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the_notes(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    context: SuiteContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[list[str]] = []
 
@@ -184,13 +184,13 @@ def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the
 
     monkeypatch.setattr(single_run, "call", call)
     note = {"notes": "a cup", "domain": "cups.md"}
-    (bench.root / "notes.json").write_text(json.dumps({"objects/a": note}))
-    (bench.root / "cups.md").write_text("")
+    (context.root / "notes.json").write_text(json.dumps({"objects/a": note}))
+    (context.root / "cups.md").write_text("")
     case = replace(CASES[0], arm="ours-llm")
-    first, again, other = (single_run.prompts(case, replace(bench, llm="http://x", model=m)) for m in ("m", "m", "n"))
+    first, again, other = (single_run.prompts(case, replace(context, llm="http://x", model=m)) for m in ("m", "m", "n"))
     assert first == again != other
     assert [arguments[arguments.index("--model") + 1] for arguments in asked] == ["m", "n"]
-    assert asked[0][asked[0].index("--domain") + 1] == str(bench.root / "cups.md")
+    assert asked[0][asked[0].index("--domain") + 1] == str(context.root / "cups.md")
 
 
 def test_overlap_of_silhouettes() -> None:
@@ -248,8 +248,8 @@ def test_smoke_trains_judges_and_draws(smoke: Path) -> None:
     for run in found["runs"]:
         assert len(run["views_out"]) == len(run["per_view"]["psnr"]) == 12
         assert run["mean"]["psnr"] == pytest.approx(sum(run["per_view"]["psnr"]) / 12, abs=1e-5)
-        assert [look["step"] for look in run["curve"]] == [8, 16, 24, 32, 40]
-        times = [run["setup_cpu_seconds"], *(look["cpu_seconds"] for look in run["curve"])]
+        assert [point["step"] for point in run["curve"]] == [8, 16, 24, 32, 40]
+        times = [run["setup_cpu_seconds"], *(point["cpu_seconds"] for point in run["curve"])]
         assert times == sorted(times)
         assert 0.3 < run["mean"]["mask_iou"] < 1
     assert "data:image/webp" in smoke.with_suffix(".html").read_text()
@@ -264,7 +264,7 @@ def test_the_same_run_gives_the_same_figures(smoke: Path, tmp_path: Path) -> Non
     assert [{k: v for k, v in run.items() if k not in DIFFERENT} for run in (first, second)] == [
         {k: v for k, v in first.items() if k not in DIFFERENT}
     ] * 2
-    assert [look["psnr"] for look in first["curve"]] == [look["psnr"] for look in second["curve"]]
+    assert [point["psnr"] for point in first["curve"]] == [point["psnr"] for point in second["curve"]]
     pictures = [result_file.read_pictures(path) for path in (smoke, file)]
     assert all(pictures[0][name] == value for name, value in pictures[1].items())
 
@@ -298,12 +298,12 @@ def test_the_published_layout_is_trained_and_judged_by_every_eighth_image(tmp_pa
     case = next(definition.cases(definition.load("paper"), 1))
     assert case.scene == "tandt/train"
     case = replace(case, iterations=10, flags=(*case.flags, "--iterations", "10"))
-    bench = Bench(tmp_path / "root", tmp_path / "work", 1)
-    bench.work.mkdir()
-    made, protocol, _ = single_run.measure(case, bench)
+    context = SuiteContext(tmp_path / "root", tmp_path / "work", 1)
+    context.work.mkdir()
+    made, protocol, _ = single_run.measure(case, context)
     assert made["views_in"] == 8
     assert made["views_out"] == ["images/00000.jpg", "images/00008.jpg"]
     assert made["per_view"]["mask_iou"] == [None, None]
     assert made["n_gaussians"] == 12 * 40
     assert "split: learned from 8 views, held out 2" in protocol
-    assert "not guided" in (single_run.reason_to_skip(replace(case, arm="ours"), bench) or "")
+    assert "not guided" in (single_run.reason_to_skip(replace(case, arm="ours"), context) or "")

@@ -14,7 +14,7 @@ from PIL import Image
 from gsopt.cli import eval as cli_eval
 from gsopt.cli import render as cli_render
 from gsopt.errors import InputError, UsageError
-from gsopt.results.finished_run import open_run, shots_along, to_bytes
+from gsopt.results.finished_run import cameras_along, open_run, to_bytes
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_drawing_the_held_out_views_gives_back_the_truth(run: Path, tmp_path: Pa
 @pytest.mark.parametrize("path", ["orbit", "turntable", "ellipse", "interpolated"])
 def test_a_film_path_has_the_frames_asked_for_and_the_subject_in_the_middle(run: Path, path: str) -> None:
     finished = open_run(run)
-    shots = shots_along(finished, path, 5, longest=20)
+    shots = cameras_along(finished, path, 5, longest=20)
     assert [name for name, _ in shots] == ["0000", "0001", "0002", "0003", "0004"]
     for _, camera in shots:
         assert (camera.width, camera.height) == (20, 16)
@@ -59,11 +59,11 @@ def test_frames_go_to_the_run_when_nothing_is_said_and_are_not_written_over(run:
 
 def test_held_out_views_that_do_not_exist_cannot_be_drawn(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="held out no views"):
-        shots_along(open_run(make_run(tmp_path, train=1, test=0)), "test", 3)
+        cameras_along(open_run(make_run(tmp_path, train=1, test=0)), "test", 3)
 
 
 def test_a_single_input_view_still_has_an_orbit(tmp_path: Path) -> None:
-    shots = shots_along(open_run(make_run(tmp_path, train=1, test=0)), "orbit", 4)
+    shots = cameras_along(open_run(make_run(tmp_path, train=1, test=0)), "orbit", 4)
     assert all(torch.isfinite(camera.viewmats).all() for _, camera in shots)
 
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from gsopt.errors import InputError, UsageError
-from gsopt.results.video import safe_name, save_film, save_stills
+from gsopt.results.video import safe_name, save_stills, save_video
 
 
 def pictures(count: int, height: int = 20, width: int = 30) -> list[torch.Tensor]:
@@ -25,7 +25,7 @@ def brightness(image: Image.Image) -> float:
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_a_film_holds_every_frame_in_order_and_repeats(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"film{suffix}"
-    save_film(path, pictures(5), fps=20)
+    save_video(path, pictures(5), fps=20)
     with Image.open(path) as film:
         assert (film.size, film.n_frames, film.info["loop"]) == ((30, 20), 5, 0)
         for index in range(5):
@@ -38,7 +38,7 @@ def test_a_film_holds_every_frame_in_order_and_repeats(tmp_path: Path, suffix: s
 def test_an_mp4_holds_every_frame_even_of_odd_size(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     path = tmp_path / "film.mp4"
-    save_film(path, pictures(5, height=33, width=51), fps=12.5)
+    save_video(path, pictures(5, height=33, width=51), fps=12.5)
     with av.open(str(path)) as film:
         frames = [frame.to_image() for frame in film.decode(video=0)]
         assert float(film.streams.video[0].average_rate) == 12.5
@@ -57,28 +57,28 @@ def test_nothing_is_written_over_unless_asked(tmp_path: Path) -> None:
     film = tmp_path / "film.gif"
     film.write_bytes(b"precious")
     with pytest.raises(UsageError, match="--overwrite"):
-        save_film(film, pictures(1), fps=10)
+        save_video(film, pictures(1), fps=10)
     (tmp_path / "a.png").write_bytes(b"precious")
     with pytest.raises(UsageError, match="--overwrite"):
         save_stills(tmp_path, [("a", pictures(1)[0])])
     assert film.read_bytes() == (tmp_path / "a.png").read_bytes() == b"precious"
-    save_film(film, pictures(2), fps=10, overwrite=True)
+    save_video(film, pictures(2), fps=10, overwrite=True)
     assert Image.open(film).n_frames == 2
 
 
 def test_a_film_that_fails_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "film.gif"
     with pytest.raises(InputError, match="one size, got 31x20 after 30x20"):
-        save_film(path, [pictures(1)[0], pictures(1, width=31)[0]], fps=10)
+        save_video(path, [pictures(1)[0], pictures(1, width=31)[0]], fps=10)
     with pytest.raises(InputError, match="at least one frame"):
-        save_film(path, [], fps=10)
+        save_video(path, [], fps=10)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["film.avi", "film", "film.png"])
 def test_an_unknown_format_is_a_usage_error(tmp_path: Path, name: str) -> None:
     with pytest.raises(UsageError, match=r"\.mp4, \.webp, \.gif"):
-        save_film(tmp_path / name, pictures(1), fps=10)
+        save_video(tmp_path / name, pictures(1), fps=10)
 
 
 @pytest.mark.parametrize(

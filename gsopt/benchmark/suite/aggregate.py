@@ -13,7 +13,7 @@ from gsopt.benchmark.suite import arm_flags
 CONFIDENCE = 0.95
 
 Run = Mapping[str, Any]
-Way = tuple[str, int]
+Variant = tuple[str, int]
 """Arm and number of steps."""
 
 
@@ -31,7 +31,7 @@ class Difference:
     count: int
 
 
-def way(run: Run) -> Way:
+def variant(run: Run) -> Variant:
     return run["arm"], run["iterations"]
 
 
@@ -44,14 +44,14 @@ def by_scene(runs: Sequence[Run], metric: str) -> dict[str, float]:
     return {scene: statistics.fmean(values) for scene, values in known.items() if len(values) == len(found[scene])}
 
 
-def differences(runs: Sequence[Run], a: Way, b: Way, metric: str) -> list[float]:
+def differences(runs: Sequence[Run], a: Variant, b: Variant, metric: str) -> list[float]:
     """Of a less b, paired by scene and seed. Seeds of one scene are no independent looks at the world: they are
     averaged first, and the values are those of scenes. With a single scene they are those of its seeds."""
-    others = {(run["scene"], run["seed"]): run["mean"][metric] for run in runs if way(run) == b}
+    others = {(run["scene"], run["seed"]): run["mean"][metric] for run in runs if variant(run) == b}
     pairs: dict[str, list[float]] = {}
     for run in runs:
         other = others.get((run["scene"], run["seed"]))
-        if way(run) == a and other is not None and run["mean"][metric] is not None:
+        if variant(run) == a and other is not None and run["mean"][metric] is not None:
             pairs.setdefault(run["scene"], []).append(run["mean"][metric] - other)
     if len(pairs) == 1:
         return next(iter(pairs.values()))
@@ -69,7 +69,7 @@ def summarized(values: Sequence[float]) -> Difference | None:
     return Difference(mean, half, min(values), max(values), sum(value > 0 for value in values), len(values))
 
 
-def t_share(t: float, degrees: int) -> float:
+def t_probability(t: float, degrees: int) -> float:
     """P(|T| < t) of Student's t with whole degrees of freedom (Abramowitz & Stegun 26.7.3 and 26.7.4)."""
     theta = math.atan(t / math.sqrt(degrees))
     cos, sin = math.cos(theta), math.sin(theta)
@@ -86,52 +86,52 @@ def t_quantile(p: float, degrees: int) -> float:
     low, high = 0.0, 1e6
     for _ in range(200):
         middle = (low + high) / 2
-        low, high = (middle, high) if 0.5 + t_share(middle, degrees) / 2 < p else (low, middle)
+        low, high = (middle, high) if 0.5 + t_probability(middle, degrees) / 2 < p else (low, middle)
     return high
 
 
-def seconds_to(curve: Sequence[Mapping[str, Any]], psnr: float) -> float | None:
+def seconds_to_psnr(curve: Sequence[Mapping[str, Any]], psnr: float) -> float | None:
     """CPU seconds until a run's course reaches that quality, linear between two looks; None when it never does."""
     before: Mapping[str, Any] | None = None
-    for look in curve:
-        if look["psnr"] >= psnr:
+    for point in curve:
+        if point["psnr"] >= psnr:
             if before is None:
-                return float(look["cpu_seconds"])
-            share = (psnr - before["psnr"]) / (look["psnr"] - before["psnr"])
-            return float(before["cpu_seconds"] + share * (look["cpu_seconds"] - before["cpu_seconds"]))
-        before = look
+                return float(point["cpu_seconds"])
+            share = (psnr - before["psnr"]) / (point["psnr"] - before["psnr"])
+            return float(before["cpu_seconds"] + share * (point["cpu_seconds"] - before["cpu_seconds"]))
+        before = point
     return None
 
 
-def reached(runs: Sequence[Run], a: Way, base: Way) -> tuple[list[float], int]:
+def times_to_match(runs: Sequence[Run], a: Variant, base: Variant) -> tuple[list[float], int]:
     """CPU seconds of each run of `a` until it is as good as the paired run of `base` ends (both by the views of the
     curve), and how many pairs there are; runs that never get there have no seconds."""
-    goals = {(run["scene"], run["seed"]): run["curve"][-1]["psnr"] for run in runs if way(run) == base}
-    pairs = [run for run in runs if way(run) == a and (run["scene"], run["seed"]) in goals]
-    times = [seconds_to(run["curve"], goals[run["scene"], run["seed"]]) for run in pairs]
+    goals = {(run["scene"], run["seed"]): run["curve"][-1]["psnr"] for run in runs if variant(run) == base}
+    pairs = [run for run in runs if variant(run) == a and (run["scene"], run["seed"]) in goals]
+    times = [seconds_to_psnr(run["curve"], goals[run["scene"], run["seed"]]) for run in pairs]
     return [time for time in times if time is not None], len(pairs)
 
 
 def mean_curve(runs: Sequence[Run], metric: str) -> list[tuple[float, float]]:
-    """(CPU seconds, metric) at each look, both averaged over runs; looks that some run lacks are left out."""
-    points = []
-    for step in sorted({look["step"] for run in runs for look in run["curve"]}):
-        looks = [look for run in runs for look in run["curve"] if look["step"] == step and look[metric] is not None]
-        if len(looks) == len(runs):
-            seconds = statistics.fmean(look["cpu_seconds"] for look in looks)
-            points.append((seconds, statistics.fmean(look[metric] for look in looks)))
-    return points
+    """(CPU seconds, metric) at each evaluated step, both averaged over runs; steps that some run lacks are left out."""
+    means = []
+    for step in sorted({point["step"] for run in runs for point in run["curve"]}):
+        points = [p for run in runs for p in run["curve"] if p["step"] == step and p[metric] is not None]
+        if len(points) == len(runs):
+            seconds = statistics.fmean(point["cpu_seconds"] for point in points)
+            means.append((seconds, statistics.fmean(point[metric] for point in points)))
+    return means
 
 
-def complete(runs: Sequence[Run], ways: Sequence[Way]) -> list[Way]:
-    """`ways` without arms of words that lack a scene or seed: of some a language model has nothing to say."""
-    made = {one: {(run["scene"], run["seed"]) for run in runs if way(run) == one} for one in ways}
+def complete(runs: Sequence[Run], variants: Sequence[Variant]) -> list[Variant]:
+    """`variants` without arms of words that lack a scene or seed: of some a language model has nothing to say."""
+    made = {one: {(run["scene"], run["seed"]) for run in runs if variant(run) == one} for one in variants}
     every = set().union(*made.values())
-    return [one for one in ways if one[0] not in arm_flags.WORDS or made[one] == every]
+    return [one for one in variants if one[0] not in arm_flags.PROMPT_SOURCES or made[one] == every]
 
 
-def common(runs: Sequence[Run], ways: Sequence[Way]) -> list[Run]:
-    """The runs of those scenes and seeds that every one of `ways` has."""
-    keys = [{(run["scene"], run["seed"]) for run in runs if way(run) == one} for one in ways]
+def common(runs: Sequence[Run], variants: Sequence[Variant]) -> list[Run]:
+    """The runs of those scenes and seeds that every one of `variants` has."""
+    keys = [{(run["scene"], run["seed"]) for run in runs if variant(run) == one} for one in variants]
     kept = set.intersection(*keys) if keys else set()
-    return [run for run in runs if (run["scene"], run["seed"]) in kept and way(run) in ways]
+    return [run for run in runs if (run["scene"], run["seed"]) in kept and variant(run) in variants]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsopt import check
 
-PLAIN = (
+PUBLISHED_SETTINGS = (
     *("--lambda-sds", "0"),
     *("--sparse.below-views", "0"),
     *("--init", "random"),
@@ -22,7 +22,7 @@ PLAIN = (
 points`), their rates, full resolution from the first step, no regularizer for few views, no guidance."""
 
 ARMS: dict[str, tuple[str, ...]] = {
-    "3dgs": PLAIN,
+    "3dgs": PUBLISHED_SETTINGS,
     "ours-0": ("--lambda-sds", "0"),
     "ours": (),
     "ours-user": (),
@@ -32,7 +32,7 @@ ARMS: dict[str, tuple[str, ...]] = {
 """3dgs: published settings; ours-0: ours without guidance; ours: the default, guided without words; the others: guided
 with the user's own words, those of the template, those of a language model."""
 
-WORDS = {"ours-user": "user", "ours-template": "template", "ours-llm": "llm:"}
+PROMPT_SOURCES = {"ours-user": "user", "ours-template": "template", "ours-llm": "llm:"}
 """Arms that guide with words, and how the source of their prompts begins in prompts.json."""
 
 

@@ -13,9 +13,9 @@ from gsopt import check
 from gsopt.benchmark.suite import arm_flags
 from gsopt.errors import InputError, UsageError
 
-SUITES = ("sparse", "paper", "smoke")
+BUILT_IN_SUITES = ("sparse", "paper", "smoke")
 PACKAGE = Path(__file__).resolve().parents[2]
-LOOKS = 5
+EVALUATIONS = 5
 """How often a run is judged on its way, its end included."""
 
 
@@ -72,7 +72,7 @@ class Case:
 
 def load(name: str) -> Suite:
     """The suite of that name; UsageError for an unknown one."""
-    check.one_of("--suite", name, SUITES)
+    check.one_of("--suite", name, BUILT_IN_SUITES)
     return parse((resources.files("gsopt.benchmark") / "suites" / f"{name}.toml").read_text(encoding="utf-8"), name)
 
 
@@ -105,7 +105,7 @@ def _group(values: dict[str, Any]) -> Group:
     )
 
 
-def chosen(suite: Suite, groups: Sequence[str]) -> Suite:
+def with_groups(suite: Suite, groups: Sequence[str]) -> Suite:
     """The suite with these groups only, all when none is named."""
     names = tuple(group.name for group in suite.groups)
     for name in groups:

@@ -15,8 +15,8 @@ from PIL import Image
 
 from gsopt._version import __version__
 from gsopt.benchmark.suite import definition as declared
-from gsopt.benchmark.suite.aggregate import Way
-from gsopt.benchmark.suite.tables import Part, about, missing, parts
+from gsopt.benchmark.suite.aggregate import Variant
+from gsopt.benchmark.suite.tables import GroupSection, about, group_sections, missing
 from gsopt.errors import InputError
 from gsopt.events import write_atomic
 
@@ -40,7 +40,7 @@ def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
     suite = declared.load(document["suite"])
     style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
     lines = "".join(f"<p>{marked(line)}</p>" for line in about(document))
-    sections = "".join(section(made, pictures) for made in parts(document))
+    sections = "".join(section(made, pictures) for made in group_sections(document))
     rest = "".join(f"<li>{marked(line)}</li>" for line in missing(document))
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -59,7 +59,7 @@ def marked(text: str) -> str:
     return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
 
 
-def section(made: Part, pictures: dict[str, Any]) -> str:
+def section(made: GroupSection, pictures: dict[str, Any]) -> str:
     """A group: tables, charts, pictures."""
     out = [f"<section><h2>{escape(made.title)}</h2><p>{marked(' '.join(made.lines))}</p>"]
     for note, (head, rows) in made.tables:
@@ -71,12 +71,12 @@ def section(made: Part, pictures: dict[str, Any]) -> str:
     return "".join(out) + grid(made, pictures) + "</section>\n"
 
 
-def grid(made: Part, pictures: dict[str, Any]) -> str:
+def grid(made: GroupSection, pictures: dict[str, Any]) -> str:
     """Input, every arm with its error below, truth; '' without pictures."""
     rows = "".join(grid_row(made, scene, pictures) for scene in made.scenes)
     if not rows:
         return ""
-    names = "".join(f"<th>{escape(arm)}<br>{steps:,}</th>" for arm, steps in made.ways)
+    names = "".join(f"<th>{escape(arm)}<br>{steps:,}</th>" for arm, steps in made.variants)
     note = (
         "The held-out view that stands farthest from all input views, chosen before any result, and the input view "
         "nearest to it; below each render its error (dark: none, bright: a quarter of the range and more). Seed 0."
@@ -85,18 +85,18 @@ def grid(made: Part, pictures: dict[str, Any]) -> str:
     return f"<p class='muted'>{note}</p><div class='scroll'><table class='grid'>{head}{rows}</table></div>"
 
 
-def grid_row(made: Part, scene: str, pictures: dict[str, Any]) -> str:
+def grid_row(made: GroupSection, scene: str, pictures: dict[str, Any]) -> str:
     shared = pictures.get(f"{scene}|{made.views}")
     if not isinstance(shared, dict):
         return ""
     cells = [f"<td>{escape(scene.rpartition('/')[2])}</td>", _cell(shared, "input")]
-    for one in made.ways:
+    for one in made.variants:
         found = find(pictures, scene, made.views, one)
         cells.append("<td class='none'>no run</td>" if found is None else _cell(found, "render", "error"))
     return f"<tr>{''.join(cells)}{_cell(shared, 'truth')}</tr>"
 
 
-def find(pictures: dict[str, Any], scene: str, views: str, one: Way) -> dict[str, Any] | None:
+def find(pictures: dict[str, Any], scene: str, views: str, one: Variant) -> dict[str, Any] | None:
     """Pictures of a run of seed 0, whatever its group."""
     ending = f"|{scene}|{views}|{one[0]}|{one[1]}|0"
     return next((value for key, value in pictures.items() if key.endswith(ending)), None)
@@ -111,7 +111,7 @@ def _cell(found: dict[str, Any], *names: str) -> str:
 def write_grid(document: dict[str, Any], pictures: dict[str, Any], path: Path, most: int = 12) -> bool:
     """The rows of the first part that have all of input, 3dgs, ours-0, ours, truth and the error of ours, as one JPEG;
     False when there is none."""
-    for made in parts(document):
+    for made in group_sections(document):
         rows = [row for scene in made.scenes if (row := _pictures(made, scene, pictures))][:most]
         if rows:
             sheet = Image.new("RGB", (len(rows[0]) * (CELL + ROOM), len(rows) * (CELL + ROOM)), "white")
@@ -125,9 +125,9 @@ def write_grid(document: dict[str, Any], pictures: dict[str, Any], path: Path, m
     return False
 
 
-def _pictures(made: Part, scene: str, pictures: dict[str, Any]) -> Sequence[str]:
+def _pictures(made: GroupSection, scene: str, pictures: dict[str, Any]) -> Sequence[str]:
     """Data URIs of a whole row; () when one is missing."""
-    steps = made.ways[0][1]
+    steps = made.variants[0][1]
     shared = pictures.get(f"{scene}|{made.views}")
     found = [find(pictures, scene, made.views, (arm, steps)) for arm in ("3dgs", "ours-0", "ours")]
     if not isinstance(shared, dict) or not all(isinstance(one, dict) for one in found):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark import schema
-from gsopt.benchmark.suite.definition import SUITES
+from gsopt.benchmark.suite.definition import BUILT_IN_SUITES
 from gsopt.data.files import read_json
 from gsopt.errors import InputError, UsageError
 from gsopt.events import write_atomic
@@ -19,7 +19,7 @@ METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "mask_iou", "depth_error")
 """Per view; the last two only where the scene has the truth for them."""
 NUMBERS = [(float, None)]
 MACHINE = {key: kind for key, kind in schema.MACHINE.items() if key != "load"}
-LOOK = {"step": int, "cpu_seconds": float, "gaussians": int, "psnr": float, "lpips_alex": (float, None)}
+CURVE_POINT = {"step": int, "cpu_seconds": float, "gaussians": int, "psnr": float, "lpips_alex": (float, None)}
 """Held-out quality of one moment; seconds count reading, first Gaussians and the guard, not the interpreter's start."""
 RUN = {
     "group": str,
@@ -34,7 +34,7 @@ RUN = {
     "views_out": [str],
     "per_view": {name: NUMBERS for name in METRICS},
     "mean": {name: (float, None) for name in METRICS},
-    "curve": [LOOK],
+    "curve": [CURVE_POINT],
     "curve_views": int,
     "setup_cpu_seconds": float,
     "train_cpu_seconds": float,
@@ -81,7 +81,7 @@ def empty(suite: str, command: str) -> dict[str, Any]:
 def read(path: Path) -> dict[str, Any]:
     """InputError for a file that is broken or holds something else."""
     document = read_json(path)
-    if document.get("suite") not in SUITES:
+    if document.get("suite") not in BUILT_IN_SUITES:
         got = str(document.get("suite"))[:40]
         raise InputError(f"{path} must hold results of a suite, got suite {got!r}. Name another file with -o.")
     schema.require(document, DOCUMENT, path.name)

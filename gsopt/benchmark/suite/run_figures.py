@@ -16,44 +16,37 @@ from gsopt.data.scene import Scene, View
 from gsopt.formats import load_splats
 from gsopt.results.evaluation import DIGITS, evaluate_views
 from gsopt.results.finished_run import FinishedRun, truth
-from gsopt.results.report.pictures import data_uri, error_map, shrunk
+from gsopt.results.report.embedded_images import data_uri, error_map, shrunk
 from gsopt.results.video import as_image
 
 CURVE_VIEWS = 8
 """Held-out views that are judged on the way, evenly spread."""
-SOLID = 0.5
+MASK_ALPHA = 0.5
 """A pixel with more alpha than this belongs to the object."""
-SIDE = 256
-LARGEST_DEPTH = 1 << 28
+IMAGE_SIDE = 256
+MAX_DEPTH_BYTES = 1 << 28
 
 Event = Mapping[str, Any]
 
 
 @torch.no_grad()
 def curve(finished: FinishedRun, scene: Scene, events: Sequence[Event], setup: float) -> list[dict[str, Any]]:
-    """Held-out quality at every preview and at the end (`suite_file.LOOK`), over CPU seconds."""
+    """Held-out quality at every preview and at the end (`suite_file.CURVE_POINT`), over CPU seconds."""
     count = min(CURVE_VIEWS, len(scene.test))
     views = [scene.test[i * len(scene.test) // count] for i in range(count)]
     steps = int(events[-1]["step"])
     previews = [event for event in events if event["kind"] == "preview" and event["step"] < steps]
     moments = [(event["step"], finished.path / event["path"]) for event in previews]
     moments.append((steps, finished.path / "splat.ply"))
-    looks = []
+    drawing = finished.backend, finished.settings, finished.background
+    points = []
     for step, path in moments:
         gaussians = load_splats(path)
-        judged = evaluate_views(
-            gaussians, views, finished.backend, finished.settings, finished.background, None, vgg=False
-        )
-        looks.append(
-            {
-                "step": step,
-                "cpu_seconds": round(setup + time_at(step, events)[0], 2),
-                "gaussians": len(gaussians),
-                "psnr": judged["mean"]["psnr"],
-                "lpips_alex": judged["mean"]["lpips_alex"],
-            }
-        )
-    return looks
+        mean = evaluate_views(gaussians, views, *drawing, None, vgg=False)["mean"]
+        cpu_seconds = round(setup + time_at(step, events)[0], 2)
+        quality = {"psnr": mean["psnr"], "lpips_alex": mean["lpips_alex"]}
+        points.append({"step": step, "cpu_seconds": cpu_seconds, "gaussians": len(gaussians), **quality})
+    return points
 
 
 @torch.no_grad()
@@ -70,8 +63,8 @@ def _shape_of(finished: FinishedRun, scene: Scene, view: View) -> tuple[float | 
         return None, None
     camera = view.camera.to(finished.gaussians.means.dtype)
     frame = finished.backend.forward(finished.gaussians, camera, finished.settings, None, depth=True)
-    solid = frame.alphas > SOLID
-    iou = overlap(solid, pixels[..., 3] > 255 * SOLID) if pixels.shape[2] == 4 else None
+    solid = frame.alphas > MASK_ALPHA
+    iou = overlap(solid, pixels[..., 3] > 255 * MASK_ALPHA) if pixels.shape[2] == 4 else None
     if depth is None or frame.depths is None:
         return iou, None
     both = solid & (depth > 0)
@@ -91,7 +84,7 @@ def read_depth(root: Path, view: View) -> Float[Tensor, "H W"] | None:
     """depth/NAME.npy as synth_views writes it: z in scene units, 0 where nothing is. None where there is none that
     fits the view's size, or that is no plain array of numbers."""
     path = root / "depth" / f"{Path(view.name).stem}.npy"
-    if not path.is_file() or path.stat().st_size > LARGEST_DEPTH:
+    if not path.is_file() or path.stat().st_size > MAX_DEPTH_BYTES:
         return None
     try:
         values = np.load(path, allow_pickle=False)
@@ -108,10 +101,10 @@ def pictures(finished: FinishedRun, scene: Scene) -> tuple[dict[str, str], dict[
     input views (chosen without looking at any result), and the input view nearest to it."""
     view, nearest = remote_view(scene)
     target, picture = as_image(truth(view, finished.background)), as_image(finished.draw(view.camera))
-    shared = {"view": view.name, "truth": data_uri(shrunk(target, SIDE)), "input_view": nearest.name}
-    shared["input"] = data_uri(shrunk(as_image(truth(nearest, finished.background)), SIDE))
+    shared = {"view": view.name, "truth": data_uri(shrunk(target, IMAGE_SIDE)), "input_view": nearest.name}
+    shared["input"] = data_uri(shrunk(as_image(truth(nearest, finished.background)), IMAGE_SIDE))
     error = error_map(picture, target)
-    return shared, {"render": data_uri(shrunk(picture, SIDE)), "error": data_uri(shrunk(error, SIDE))}
+    return shared, {"render": data_uri(shrunk(picture, IMAGE_SIDE)), "error": data_uri(shrunk(error, IMAGE_SIDE))}
 
 
 def remote_view(scene: Scene) -> tuple[View, View]:

@@ -17,7 +17,7 @@ DRAWING = (
     "results/report/",
     "results/viewer.py",
     "benchmark/charts.py",
-    "benchmark/document.py",
+    "benchmark/markdown.py",
     "benchmark/suite/tables.py",
     "benchmark/suite/html_page.py",
     "benchmark/suite/aggregate.py",

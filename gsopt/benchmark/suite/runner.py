@@ -13,9 +13,9 @@ import torch
 from gsopt.benchmark.machine import machine
 from gsopt.benchmark.suite import result_file, single_run
 from gsopt.benchmark.suite.definition import Case
-from gsopt.benchmark.suite.single_run import Bench, RunFailed
+from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 def work_folder(path: Path) -> Path:
@@ -23,7 +23,9 @@ def work_folder(path: Path) -> Path:
     return path.with_name(f"{path.stem}-runs")
 
 
-def run_suite(path: Path, suite: str, command: str, cases: Sequence[Case], bench: Bench, tell: Tell) -> list[str]:
+def run_suite(
+    path: Path, suite: str, command: str, cases: Sequence[Case], context: SuiteContext, report: Report
+) -> list[str]:
     """Bring the result file up to date with `cases`; returns what failed. A kill loses the run that was being made.
 
     Raises UsageError and InputError for a file of another suite or a broken one, before anything is run.
@@ -31,40 +33,40 @@ def run_suite(path: Path, suite: str, command: str, cases: Sequence[Case], bench
     path.parent.mkdir(parents=True, exist_ok=True)
     with result_file.locked(path):
         document = result_file.opened(path, suite, command)
-        bench.work.mkdir(parents=True, exist_ok=True)
-        for stale in bench.work.glob("run-*"):  # of a killed call
+        context.work.mkdir(parents=True, exist_ok=True)
+        for stale in context.work.glob("run-*"):  # of a killed call
             shutil.rmtree(stale, ignore_errors=True)
         torch.set_num_threads(1)
         failed: list[str] = []
         for number, case in enumerate(cases, 1):
-            document, told = _one(path, document, case, bench)
-            if told:
-                tell(f"{number}/{len(cases)} {told}")
-            failed += [case.id] if " failed: " in told else []
+            document, message = _one(path, document, case, context)
+            if message:
+                report(f"{number}/{len(cases)} {message}")
+            failed += [case.id] if " failed: " in message else []
         return failed
 
 
-def _one(path: Path, document: dict[str, Any], case: Case, bench: Bench) -> tuple[dict[str, Any], str]:
+def _one(path: Path, document: dict[str, Any], case: Case, context: SuiteContext) -> tuple[dict[str, Any], str]:
     """The document after one case, written when it changed, and what there is to tell."""
-    told, old = "", next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
-    if (reason := single_run.reason_to_skip(case, bench)) is not None:
+    message, old = "", next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
+    if (reason := single_run.reason_to_skip(case, context)) is not None:
         skip = {**_named(case), "reason": reason}
         if old is not None or skip in document["skipped"]:  # a record made where a prior was at hand stays
             return document, ""
         document = result_file.with_skip(document, skip)
     else:
         try:
-            if old is not None and old["key"] == single_run.key(case, bench):
+            if old is not None and old["key"] == single_run.key(case, context):
                 return document, ""
-            record, protocol, pictures = single_run.measure(case, bench)
+            record, protocol, pictures = single_run.measure(case, context)
         except RunFailed as error:
             return document, f"{case.id} failed: {error}"
         document = result_file.with_run(document, record, machine(), protocol)
         if pictures:
             result_file.write_pictures(path, {**result_file.read_pictures(path), **pictures})
-        told = line(record)
+        message = line(record)
     result_file.write(path, document)
-    return document, told
+    return document, message
 
 
 def _named(case: Case) -> dict[str, Any]:

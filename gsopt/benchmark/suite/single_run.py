@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark.suite import arm_flags, run_key
-from gsopt.benchmark.suite.definition import LOOKS, Case
+from gsopt.benchmark.suite.definition import EVALUATIONS, Case
 from gsopt.benchmark.suite.result_file import METRICS
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import DataConfig
@@ -28,7 +28,7 @@ from gsopt.results.evaluation import read_metrics
 from gsopt.results.finished_run import open_run
 from gsopt.sds.select_prior import EMBEDDED, choose, fitting
 
-TOLD = 12
+MAX_ERROR_LINES = 12
 """Last lines of a failed run's output that are repeated."""
 
 
@@ -39,7 +39,7 @@ class RunFailed(GsoptError):
 
 
 @dataclass(frozen=True)
-class Bench:
+class SuiteContext:
     """What the runs of one call share."""
 
     root: Path
@@ -52,30 +52,30 @@ class Bench:
     model: str = ""
 
 
-def reason_to_skip(case: Case, bench: Bench) -> str | None:
+def reason_to_skip(case: Case, context: SuiteContext) -> str | None:
     """Why a run would say nothing; None when it is to be made."""
     if not arm_flags.is_guided(case.arm):
         return None
-    config = GuidanceConfig(prior=bench.prior or "auto")
+    config = GuidanceConfig(prior=context.prior or "auto")
     choice = choose(config)
-    if choice.prior is not None and not bench.prior:
-        views = load_scene(data_config(case, bench.root))
+    if choice.prior is not None and not context.prior:
+        views = load_scene(data_config(case, context.root))
         choice = fitting(choice, config, len(views.train), views.has_alpha)
     if choice.prior is None:
         return f"the same as ours-0, not guided: {choice.reason}"
-    if case.arm not in arm_flags.WORDS:
+    if case.arm not in arm_flags.PROMPT_SOURCES:
         return None
-    return _no_words(case, bench, choice.prior)
+    return _reason_without_prompts(case, context, choice.prior)
 
 
-def _no_words(case: Case, bench: Bench, prior: str) -> str | None:
+def _reason_without_prompts(case: Case, context: SuiteContext, prior: str) -> str | None:
     from gsopt.sds.load_prior import open_prior
 
     if open_prior(prior, GuidanceConfig(prior=prior)).encoder() is None:
         return f"the prior {prior} takes no words: prompts cannot change anything"
-    if case.arm == "ours-llm" and not bench.llm:
+    if case.arm == "ours-llm" and not context.llm:
         return "no language model named: --llm URL"
-    if case.scene not in notes(bench.root):
+    if case.scene not in notes(context.root):
         return f"no words for {case.scene} in notes.json below the root"
     return None
 
@@ -98,55 +98,56 @@ def data_config(case: Case, root: Path) -> DataConfig:
     return DataConfig(str(root / case.scene), views=views, view_ids=ids, downscale=factor, eval="--eval" in flags)
 
 
-def settings(case: Case, bench: Bench) -> list[str]:
+def settings(case: Case, context: SuiteContext) -> list[str]:
     """Everything that the run's figures depend on beside its data and the code."""
-    own = [*case.flags, f"looks={LOOKS}"]
+    own = [*case.flags, f"looks={EVALUATIONS}"]
     vgg = find_vgg_weights()
     own.append("vgg=" + ("none" if vgg is None else run_key.file_hash(vgg).hex()))
     if arm_flags.is_guided(case.arm):
-        folder = Path(bench.prior) if bench.prior and Path(bench.prior).is_dir() else EMBEDDED
-        own.append(f"prior={bench.prior or 'auto'} {run_key.folder_hash(folder.absolute())}")
-    if (path := prompts(case, bench)) is not None:
+        folder = Path(context.prior) if context.prior and Path(context.prior).is_dir() else EMBEDDED
+        own.append(f"prior={context.prior or 'auto'} {run_key.folder_hash(folder.absolute())}")
+    if (path := prompts(case, context)) is not None:
         own.append("prompts=" + run_key.file_hash(path).hex())
     return own
 
 
-def key(case: Case, bench: Bench) -> str:
+def key(case: Case, context: SuiteContext) -> str:
     """Hash of settings, data and code: a record with the same key is this run."""
-    data = run_key.folder_hash((bench.root / case.scene).absolute())
-    return run_key.key(settings(case, bench), data, run_key.code_hash())
+    data = run_key.folder_hash((context.root / case.scene).absolute())
+    return run_key.key(settings(case, context), data, run_key.code_hash())
 
 
-def prompts(case: Case, bench: Bench) -> Path | None:
+def prompts(case: Case, context: SuiteContext) -> Path | None:
     """The arm's prompts.json, made once per scene; None for an arm without words."""
-    if case.arm not in arm_flags.WORDS:
+    if case.arm not in arm_flags.PROMPT_SOURCES:
         return None
-    note = notes(bench.root)[case.scene]
-    asked = hashlib.sha256(json.dumps([note, bench.llm, bench.model, run_key.code_hash()]).encode()).hexdigest()[:12]
-    path = bench.work / "prompts" / f"{case.scene.replace('/', '-')}-{case.arm}-{asked}.json"
+    note = notes(context.root)[case.scene]
+    inputs = json.dumps([note, context.llm, context.model, run_key.code_hash()]).encode()
+    asked = hashlib.sha256(inputs).hexdigest()[:12]
+    path = context.work / "prompts" / f"{case.scene.replace('/', '-')}-{case.arm}-{asked}.json"
     if path.exists():
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     every = path.with_name(f"all-{path.name}")
     domain = str(note.get("domain", "generic"))
-    if (bench.root / domain).is_file():  # a template of one's own, named relative to notes.json
-        domain = str((bench.root / domain).absolute())
+    if (context.root / domain).is_file():  # a template of one's own, named relative to notes.json
+        domain = str((context.root / domain).absolute())
     command = ["prompts", "--notes", str(note["notes"]), "--domain", domain]
     command += ["--category", str(note["category"])] if "category" in note else []
-    command += ["--llm", bench.llm, "--model", bench.model] if case.arm == "ours-llm" else []
+    command += ["--llm", context.llm, "--model", context.model] if case.arm == "ours-llm" else []
     call([*command, "-o", str(every), "--overwrite"], path.with_suffix(".log"))
     found = read_set(every).prompts
-    write_prompts(path, [prompt for prompt in found if prompt.source.startswith(arm_flags.WORDS[case.arm])])
+    write_prompts(path, [prompt for prompt in found if prompt.source.startswith(arm_flags.PROMPT_SOURCES[case.arm])])
     return path
 
 
-def machine_flags(case: Case, bench: Bench) -> list[str]:
+def machine_flags(case: Case, context: SuiteContext) -> list[str]:
     """Flags that change how fast a run is and where its previews lie, not a bit of its result."""
-    flags = ["--threads", str(bench.threads), "--checkpoint-every", "0"]
-    flags += ["--preview-every", str(max(1, case.iterations // LOOKS))]
-    if arm_flags.is_guided(case.arm) and bench.prior:
-        flags += ["--prior", bench.prior]
-    path = prompts(case, bench)
+    flags = ["--threads", str(context.threads), "--checkpoint-every", "0"]
+    flags += ["--preview-every", str(max(1, case.iterations // EVALUATIONS))]
+    if arm_flags.is_guided(case.arm) and context.prior:
+        flags += ["--prior", context.prior]
+    path = prompts(case, context)
     return flags if path is None else [*flags, "--prompts", str(path)]
 
 
@@ -165,26 +166,26 @@ def call(arguments: list[str], log: Path) -> None:
     if done.returncode in (-signal.SIGINT, -signal.SIGTERM, 130):
         raise KeyboardInterrupt
     if done.returncode:
-        last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-TOLD:]
+        last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-MAX_ERROR_LINES:]
         raise RunFailed(
             f"`gsopt {' '.join(arguments)}` ended with exit code {done.returncode}: {' / '.join(last)}. "
             "Mend that and call the suite again: it makes only what is missing."
         )
 
 
-def measure(case: Case, bench: Bench) -> tuple[dict[str, Any], str, dict[str, Any]]:
+def measure(case: Case, context: SuiteContext) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Train and judge: the record (`suite_file.RUN` without its references), the protocol, the pictures of seed 0."""
-    folder = Path(tempfile.mkdtemp(prefix="run-", dir=bench.work))
+    folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.work))
     try:
         run = folder / "run"
-        arguments = ["train", str(bench.root / case.scene), "-m", str(run), *case.flags, *machine_flags(case, bench)]
-        call(arguments, folder / "output.txt")
-        return recorded(case, bench, run)
+        data = str(context.root / case.scene)
+        call(["train", data, "-m", str(run), *case.flags, *machine_flags(case, context)], folder / "output.txt")
+        return recorded(case, context, run)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def recorded(case: Case, bench: Bench, run: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
+def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
     """Every figure of a finished run."""
     from gsopt.benchmark.suite import run_figures
 
@@ -193,7 +194,7 @@ def recorded(case: Case, bench: Bench, run: Path) -> tuple[dict[str, Any], str, 
         raise RunFailed(f"{case.id} must end with `done`, got {events[-1]['kind']!r}. Call the suite again.")
     if not metrics.get("per_view"):
         raise InputError(f"{case.scene} holds out no views, so nothing can be judged. Add --eval to its group.")
-    finished = open_run(run, threads=bench.threads)
+    finished = open_run(run, threads=context.threads)
     scene = load_scene(finished.config.data)
     started = next(event for event in events if event["kind"] == "started")
     setup = float(started.get("setup_cpu_seconds", 0.0))
@@ -206,7 +207,7 @@ def recorded(case: Case, bench: Bench, run: Path) -> tuple[dict[str, Any], str, 
         "arm": case.arm,
         "iterations": case.iterations,
         "seed": case.seed,
-        "key": key(case, bench),
+        "key": key(case, context),
         "flags": list(case.flags),
         "views_in": len(scene.train),
         "views_out": [row["name"] for row in metrics["per_view"]],

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark.charts import Axis, Series, chart
-from gsopt.benchmark.document import replace_block, table
+from gsopt.benchmark.markdown import replace_block, table
 from gsopt.benchmark.suite import aggregate, arm_flags
 from gsopt.benchmark.suite import definition as declared
-from gsopt.benchmark.suite.aggregate import Difference, Run, Way, way
+from gsopt.benchmark.suite.aggregate import Difference, Run, Variant, variant
 from gsopt.benchmark.suite.definition import Group, Suite, view_count
 from gsopt.events import write_atomic
 
@@ -31,7 +31,7 @@ Table = tuple[list[str], list[list[str]]]
 
 
 @dataclass
-class Part:
+class GroupSection:
     """One group at one number of views: what a page shows of it."""
 
     title: str
@@ -43,58 +43,58 @@ class Part:
     scenes: list[str] = field(default_factory=list)
     """Of the picture grid, in the suite's order."""
     views: str = ""
-    ways: list[Way] = field(default_factory=list)
+    variants: list[Variant] = field(default_factory=list)
 
 
-def parts(document: dict[str, Any]) -> list[Part]:
+def group_sections(document: dict[str, Any]) -> list[GroupSection]:
     """Every group and number of views that has a run, in the suite's order."""
     suite = declared.load(document["suite"])
     return [
-        part(suite, group, views, found)
+        group_section(suite, group, views, found)
         for group in suite.groups
         for views in group.views
         if (found := [r for r in document["runs"] if r["group"] == group.name and r["views"] == views])
     ]
 
 
-def part(suite: Suite, group: Group, views: str, runs: list[Run]) -> Part:
+def group_section(suite: Suite, group: Group, views: str, runs: list[Run]) -> GroupSection:
     """The tables of runs that were learned alike."""
-    ways = [one for one in group.runs if any(way(run) == one for run in runs)]
+    variants = [one for one in group.runs if any(variant(run) == one for run in runs)]
     several = len(group.views) > 1
     title = group.title + (f": {view_count(views)} views" if several else "")
-    made = Part(title, [group.why], views=views, ways=ways)
+    made = GroupSection(title, [group.why], views=views, variants=variants)
     made.scenes = [scene for scene in group.scenes if any(run["scene"] == scene for run in runs)]
     seeds = sorted({run["seed"] for run in runs})
     which = ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
     made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, {which}.")
-    whole = aggregate.complete(runs, ways)
+    whole = aggregate.complete(runs, variants)
     same = aggregate.common(runs, whole)
     note = "Means over scenes, seeds averaged first; " + ("what every arm has." if same else "arms differ in scenes.")
-    if lacking := [_name(one) for one in ways if one not in whole] if same else []:
+    if lacking := [_name(one) for one in variants if one not in whole] if same else []:
         note += f" Not of {', '.join(lacking)}, where scenes or seeds are missing."
-    made.tables.append((note, figures(same or runs, whole if same else ways)))
-    pairs = list(comparisons(group, ways))
+    made.tables.append((note, figures(same or runs, whole if same else variants)))
+    pairs = list(comparisons(group, variants))
     if rows := [row for a, b in pairs if (row := compared(runs, a, b))]:
         what = "scenes" if len(made.scenes) > 1 else "seeds of the one scene"
         head = ["paired difference", what, *(f"Δ {METRICS[m][0]}" for m in COMPARED), "PSNR worst", "PSNR better in"]
         made.tables.append(("Mean with its 95 % confidence interval (Student's t); losses included.", (head, rows)))
-    if len(ways) > 1 and (rows := [row for a in ways if (row := time_row(runs, a, ways[0]))]):
-        note = f"CPU seconds until a run is as good as {_name(ways[0])} ends on the same scene (PSNR of "
-        note += f"{max(run['curve_views'] for run in runs)} held-out views, looked at {declared.LOOKS} times)."
+    if len(variants) > 1 and (rows := [row for a in variants if (row := time_row(runs, a, variants[0]))]):
+        note = f"CPU seconds until a run is as good as {_name(variants[0])} ends on the same scene (PSNR of "
+        note += f"{max(run['curve_views'] for run in runs)} held-out views, looked at {declared.EVALUATIONS} times)."
         made.tables.append((note, (["arm", "median of those that get there", "get there", "whole run, median"], rows)))
     if len(made.scenes) > 1:
-        made.tables.append(("PSNR of every scene.", scene_rows(runs, made.scenes, ways)))
+        made.tables.append(("PSNR of every scene.", scene_rows(runs, made.scenes, variants)))
     made.charts = charts(f"suite-{suite.name}-{group.name}" + (f"-{view_count(views)}" if several else ""), made, runs)
     return made
 
 
-def figures(runs: Sequence[Run], ways: Sequence[Way]) -> Table:
+def figures(runs: Sequence[Run], variants: Sequence[Variant]) -> Table:
     """Means of every arm."""
     shown = [m for m in METRICS if any(run["mean"][m] is not None for run in runs)]
     head = ["arm", "scenes", *(METRICS[m][0] for m in shown), "Gaussians", "CPU s", "peak MB"]
     rows = []
-    for one in ways:
-        mine = [run for run in runs if way(run) == one]
+    for one in variants:
+        mine = [run for run in runs if variant(run) == one]
         row = [_name(one), str(len({run["scene"] for run in mine}))]
         for metric in shown:
             values = aggregate.by_scene(mine, metric).values()
@@ -111,20 +111,20 @@ def seconds(run: Run) -> float:
     return float(run["setup_cpu_seconds"] + run["train_cpu_seconds"])
 
 
-def comparisons(group: Group, ways: Sequence[Way]) -> Iterator[tuple[Way, Way]]:
+def comparisons(group: Group, variants: Sequence[Variant]) -> Iterator[tuple[Variant, Variant]]:
     """Each arm against the group's first; guided against unguided; ours against 3dgs that ran longer."""
-    base = ways[0]
-    for one in ways[1:]:
+    base = variants[0]
+    for one in variants[1:]:
         yield one, base
-    for arm, steps in ways:
-        if arm_flags.is_guided(arm) and ("ours-0", steps) in ways:
+    for arm, steps in variants:
+        if arm_flags.is_guided(arm) and ("ours-0", steps) in variants:
             yield (arm, steps), ("ours-0", steps)
-    for arm, steps in ways:
-        longer = [(a, n) for a, n in ways if a == base[0] and n > steps and (a, n) != base]
+    for arm, steps in variants:
+        longer = [(a, n) for a, n in variants if a == base[0] and n > steps and (a, n) != base]
         yield from (((arm, steps), other) for other in longer if arm != base[0])
 
 
-def compared(runs: Sequence[Run], a: Way, b: Way) -> list[str]:
+def compared(runs: Sequence[Run], a: Variant, b: Variant) -> list[str]:
     """A row of the table of differences; [] without a pair."""
     found = {m: aggregate.summarized(aggregate.differences(runs, a, b, m)) for m in COMPARED}
     psnr = found["psnr"]
@@ -141,39 +141,39 @@ def _interval(found: Difference | None, digits: int) -> str:
     return f"{found.mean:+.{digits}f}" + ("" if found.half is None else f" ± {found.half:.{digits}f}")
 
 
-def time_row(runs: Sequence[Run], a: Way, base: Way) -> list[str]:
-    times, pairs = aggregate.reached(runs, a, base)
+def time_row(runs: Sequence[Run], a: Variant, base: Variant) -> list[str]:
+    times, pairs = aggregate.times_to_match(runs, a, base)
     if not pairs:
         return []
-    whole = statistics.median(seconds(run) for run in runs if way(run) == a)
+    whole = statistics.median(seconds(run) for run in runs if variant(run) == a)
     median = f"{statistics.median(times):.0f} s" if times else ""
     return [_name(a), median, f"{len(times)} of {pairs}", f"{whole:.0f} s"]
 
 
-def scene_rows(runs: Sequence[Run], scenes: Sequence[str], ways: Sequence[Way]) -> Table:
+def scene_rows(runs: Sequence[Run], scenes: Sequence[str], variants: Sequence[Variant]) -> Table:
     """One row per scene; the seeds that its arms share averaged; what the guard left of the guidance."""
     rows = []
     for scene in scenes:
         row = [scene.rpartition("/")[2]]
         here = [run for run in runs if run["scene"] == scene]
-        here = aggregate.common(here, [one for one in ways if any(way(run) == one for run in here)]) or here
-        for one in ways:
-            value = aggregate.by_scene([run for run in here if way(run) == one], "psnr").get(scene)
+        here = aggregate.common(here, [one for one in variants if any(variant(run) == one for run in here)]) or here
+        for one in variants:
+            value = aggregate.by_scene([run for run in here if variant(run) == one], "psnr").get(scene)
             row.append("" if value is None else f"{value:.2f}")
         factors = [run["guidance"]["factor"] for run in here]
         rows.append([*row, ", ".join(f"{factor:g}" for factor in factors if factor is not None)])
-    return ["scene", *(_name(one) for one in ways), "guard's factor"], rows
+    return ["scene", *(_name(one) for one in variants), "guard's factor"], rows
 
 
-def charts(stem: str, made: Part, runs: Sequence[Run]) -> dict[str, str]:
+def charts(stem: str, made: GroupSection, runs: Sequence[Run]) -> dict[str, str]:
     """Quality over CPU seconds of the arms that lack no scene, over the scenes and seeds that all of these have."""
-    whole = aggregate.complete(runs, made.ways)
+    whole = aggregate.complete(runs, made.variants)
     same = aggregate.common(runs, whole)
     if not same:
         return {}
     drawn = {}
     for metric, label in (("psnr", "PSNR, dB"), ("lpips_alex", "LPIPS (Alex), lower is better")):
-        series = [Series(_name(one), aggregate.mean_curve([r for r in same if way(r) == one], metric)) for one in whole]
+        series = [Series(_name(v), aggregate.mean_curve([r for r in same if variant(r) == v], metric)) for v in whole]
         title = f"{made.title} ({_count(len({run['scene'] for run in same}), 'scene')})"
         drawn[f"{stem}-{metric.partition('_')[0]}"] = chart(title, Axis("CPU seconds"), Axis(label), series)
     return drawn
@@ -220,7 +220,7 @@ def missing(document: dict[str, Any]) -> list[str]:
 def write_page(document: dict[str, Any], page: Path) -> None:
     """Rewrite the block of the suite in a Markdown page and the charts beside it, in img/."""
     blocks = [*about(document)]
-    for made in parts(document):
+    for made in group_sections(document):
         blocks += [f"### {made.title}", " ".join(made.lines)]
         for note, (head, rows) in made.tables:
             blocks += [note, table(head, rows)]
@@ -238,7 +238,7 @@ def _folder(page: Path) -> Path:
     return folder
 
 
-def _name(one: Way) -> str:
+def _name(one: Variant) -> str:
     return f"{one[0]}, {one[1]:,}"
 
 

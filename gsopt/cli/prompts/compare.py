@@ -126,7 +126,7 @@ def distinct_names(files: Sequence[Path]) -> list[str]:
 def write_page(flags: Flags, compared: Comparison, prior: str) -> None:
     """The page and its figures."""
     from gsopt.events import to_json, write_atomic
-    from gsopt.results.report.comparison import Column, comparison_page
+    from gsopt.results.report.prompt_comparison import Column, comparison_page
 
     columns = [
         Column(

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from gsopt.config.train import TrainConfig
 from gsopt.events import write_atomic
-from gsopt.results.report.gather import gather
 from gsopt.results.report.page import page
+from gsopt.results.report.read_run import read_run
 
 __all__ = ["write_report"]
 
@@ -21,5 +21,5 @@ def write_report(run: Path) -> Path:
     run = Path(run)
     config = TrainConfig.read(run / "config.json")
     path = run / "report.html"
-    write_atomic(path, page(gather(run, config)).encode())
+    write_atomic(path, page(read_run(run, config)).encode())
     return path

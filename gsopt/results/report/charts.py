@@ -8,8 +8,8 @@ from html import escape
 
 WIDTH, HEIGHT = 360, 210
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 14, 36
-MOST_POINTS = 300
-SMALLEST = 1e-300
+MAX_POINTS = 300
+MIN_LOG_VALUE = 1e-300
 """Of a logarithmic axis: its ticks must not be 0."""
 
 
@@ -18,7 +18,7 @@ def line_chart(title: str, points: Sequence[tuple[float, float]], *, log: bool =
 
     `log`: logarithmic vertical axis; points that are not above SMALLEST are left out then.
     """
-    points = [point for point in points if not log or point[1] > SMALLEST]
+    points = [point for point in points if not log or point[1] > MIN_LOG_VALUE]
     if len(points) < 2:
         return (
             f'<figure class="chart"><figcaption>{escape(title)}</figcaption><p class="muted">Not recorded.</p></figure>'
@@ -73,7 +73,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 def thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """At most about MOST_POINTS points: means over runs of equal length, the last point as it is."""
-    run = math.ceil(len(points) / MOST_POINTS)
+    run = math.ceil(len(points) / MAX_POINTS)
     groups = [points[start : start + run] for start in range(0, len(points) - 1, run)]
     means = [(sum(x for x, _ in group) / len(group), sum(y for _, y in group) / len(group)) for group in groups]
     return [*(means if run > 1 else points[:-1]), points[-1]]

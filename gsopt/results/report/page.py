@@ -10,11 +10,11 @@ from typing import Any
 from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
 from gsopt.results.report.charts import line_chart
-from gsopt.results.report.gather import Judged, Report, number
-from gsopt.results.report.pictures import ERROR_FULL_SCALE, data_uri, error_gradient, error_map, film_uri, shrunk
+from gsopt.results.report.embedded_images import animation_uri, data_uri, error_legend, error_map, shrunk
+from gsopt.results.report.read_run import EvaluatedView, Report, number
 
 VIEW_SIDE = 400
-NOTHING = "\N{EN DASH}"
+NO_VALUE = "\N{EN DASH}"
 """Stands where there is no value."""
 TURNTABLE_FPS = 12.0
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (Alex)", "lpips_vgg": "LPIPS (VGG)"}
@@ -33,7 +33,7 @@ def page(report: Report) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
         f'content="light dark"><link rel="icon" href="data:,"><title>{escape(report.name)} · gsopt report</title>'
-        f"<style>\n{style}</style></head>\n<body><main>\n{''.join(sections)}{course(report)}{settings(report)}</main>\n{footer(report)}</body></html>\n"
+        f"<style>\n{style}</style></head>\n<body><main>\n{''.join(sections)}{progress_charts(report)}{settings(report)}</main>\n{footer(report)}</body></html>\n"
     )
 
 
@@ -53,7 +53,7 @@ def header(report: Report) -> str:
 def _turntable(report: Report) -> str:
     if not report.turntable:
         return '<div class="turntable empty"><p class="muted">No turntable.</p></div>'
-    still, film = data_uri(report.turntable[0]), film_uri(report.turntable, TURNTABLE_FPS)
+    still, film = data_uri(report.turntable[0]), animation_uri(report.turntable, TURNTABLE_FPS)
     return (
         f'<picture class="turntable"><source media="(prefers-reduced-motion: reduce)" srcset="{still}">'
         f'<img src="{film}" alt="Turntable of the result"></picture>'
@@ -71,12 +71,12 @@ def _scope(report: Report) -> str:
 def _tiles(report: Report) -> Iterable[str]:
     for key, title in TITLES.items():
         yield _tile(title, figure(key, report.mean.get(key)), HINTS.get(key, "lower is better"))
-    yield _tile("Gaussians", NOTHING if report.n_gaussians is None else f"{report.n_gaussians:,}", "")
+    yield _tile("Gaussians", NO_VALUE if report.n_gaussians is None else f"{report.n_gaussians:,}", "")
     seconds = number(report.metrics.get("train_seconds"))
     if seconds is None and report.progress:
         seconds = report.progress[-1].seconds
     yield _tile(
-        "Training", NOTHING if seconds is None else duration(seconds), report.backend and f"backend {report.backend}"
+        "Training", NO_VALUE if seconds is None else duration(seconds), report.backend and f"backend {report.backend}"
     )
     memory = number(report.metrics.get("peak_memory_mb"))
     if memory is not None:
@@ -100,36 +100,32 @@ def messages(report: Report) -> str:
 
 def views(report: Report) -> str:
     """Renders beside truth and error, worst first."""
-    if not report.judged:
+    if not report.evaluated:
         return ""
     kind = "Held-out views" if report.held_out else "Training views (not held out)"
-    worst, best = report.judged[0], report.judged[-1]
-    shown, judged = len(report.judged), len(report.per_view)
-    count = f"All {judged} are" if shown == judged else f"{shown} of {judged} are"
+    worst, best = report.evaluated[0], report.evaluated[-1]
+    shown, evaluated = len(report.evaluated), len(report.per_view)
+    count = f"All {evaluated} are" if shown == evaluated else f"{shown} of {evaluated} are"
     lead = (
         f"Worst: <b>{escape(worst.name)}</b> ({figure('psnr', worst.figures['psnr'])} dB). "
         f"Best: <b>{escape(best.name)}</b> ({figure('psnr', best.figures['psnr'])} dB). "
         f"{count} shown, by rising PSNR."
     )
-    legend = (
-        f'<p class="legend"><span>Error 0</span><i style="background:{error_gradient()}"></i>'
-        f"<span>{ERROR_FULL_SCALE:g} and more (mean absolute difference of the channels, of 1)</span></p>"
-    )
-    cards = "".join(_card(judged) for judged in report.judged)
-    return f'<section><h2>{kind}</h2><p>{lead}</p>{legend}<div class="cards">{cards}</div>{_table(report)}</section>\n'
+    cards = f'{error_legend()}<div class="cards">{"".join(map(_card, report.evaluated))}</div>'
+    return f"<section><h2>{kind}</h2><p>{lead}</p>{cards}{_table(report)}</section>\n"
 
 
-def _card(judged: Judged) -> str:
-    shown = (("render", judged.render), ("truth", judged.truth), ("error", error_map(judged.render, judged.truth)))
-    name = escape(judged.name)
+def _card(view: EvaluatedView) -> str:
+    shown = (("render", view.render), ("truth", view.truth), ("error", error_map(view.render, view.truth)))
+    name = escape(view.name)
     pictures = "".join(
         f'<figure><img loading="lazy" src="{data_uri(shrunk(image, VIEW_SIDE))}" alt="{title} of {name}">'
         f"<figcaption>{title}</figcaption></figure>"
         for title, image in shown
     )
-    badge = f'<span class="badge {judged.badge}">{judged.badge}</span>' if judged.badge else ""
+    badge = f'<span class="badge {view.badge}">{view.badge}</span>' if view.badge else ""
     figures = " · ".join(
-        f"{TITLES[key]} {figure(key, value)}" for key, value in judged.figures.items() if value is not None
+        f"{TITLES[key]} {figure(key, value)}" for key, value in view.figures.items() if value is not None
     )
     return (
         f'<article class="card"><div class="triple">{pictures}</div>'
@@ -165,7 +161,7 @@ def inputs(report: Report) -> str:
     return f'<section><h2>Input views{more}</h2><div class="inputs">{pictures}</div></section>\n'
 
 
-def course(report: Report) -> str:
+def progress_charts(report: Report) -> str:
     """Loss, PSNR and number of Gaussians over the run."""
     charts = (
         line_chart("Loss", _series(report, "loss"), log=True),
@@ -210,7 +206,7 @@ def _setting_rows(values: dict[str, Any], default: dict[str, Any], prefix: str =
             continue
         changed = ' class="changed"' if value != default[key] else ""
         shown = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-        shown = NOTHING if value is None or value == [] else shown
+        shown = NO_VALUE if value is None or value == [] else shown
         yield f'<tr{changed}><th scope="row">{escape(prefix + key)}</th><td>{escape(shown)}</td></tr>'
 
 
@@ -225,7 +221,7 @@ def footer(report: Report) -> str:
 
 
 def figure(key: str, value: float | None) -> str:
-    return NOTHING if value is None else f"{value:.{DIGITS[key]}f}"
+    return NO_VALUE if value is None else f"{value:.{DIGITS[key]}f}"
 
 
 def duration(seconds: float) -> str:

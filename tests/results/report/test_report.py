@@ -17,9 +17,9 @@ from gsopt.errors import InputError
 from gsopt.events import EventWriter
 from gsopt.results.evaluation import evaluate
 from gsopt.results.report import charts, write_report
-from gsopt.results.report.gather import chosen, number, progress_of
+from gsopt.results.report.embedded_images import ERROR_COLORS, ERROR_FULL_SCALE, error_map
 from gsopt.results.report.page import duration
-from gsopt.results.report.pictures import ERROR_COLORS, ERROR_FULL_SCALE, error_map
+from gsopt.results.report.read_run import number, progress_of, representative_rows
 
 VOID = {"meta", "link", "img", "br", "source", "line", "circle", "polyline"}
 SIZE_LIMIT = 8 << 20
@@ -154,14 +154,14 @@ def test_the_same_run_gives_the_same_page(run: Path) -> None:
 
 def test_what_a_resumed_run_took_back_is_not_drawn() -> None:
     steps = [10, 20, 30, 25, 35]
-    course = progress_of([{"kind": "progress", "step": step, "loss": i} for i, step in enumerate(steps)])
-    assert [(moment.step, moment.loss) for moment in course] == [(10, 0), (20, 1), (25, 3), (35, 4)]
+    progress_charts = progress_of([{"kind": "progress", "step": step, "loss": i} for i, step in enumerate(steps)])
+    assert [(moment.step, moment.loss) for moment in progress_charts] == [(10, 0), (20, 1), (25, 3), (35, 4)]
 
 
 @pytest.mark.parametrize("count", [1, 2, 12, 13, 40, 200])
 def test_the_views_shown_include_both_ends_in_order(count: int) -> None:
     psnrs = np.random.default_rng(count).permutation(count).astype(float).tolist()
-    shown = [psnrs[row] for row in chosen(psnrs)]
+    shown = [psnrs[row] for row in representative_rows(psnrs)]
     assert shown == sorted(shown)
     assert len(set(shown)) == len(shown) == min(count, 12)
     ends = min(count, 4)
@@ -201,7 +201,7 @@ def test_a_chart_stays_inside_its_frame_and_keeps_the_last_value() -> None:
     points = [(float(step), 1 / (step + 1)) for step in range(5000)]
     svg = charts.line_chart("Loss", points, log=True)
     drawn = [tuple(map(float, pair.split(","))) for pair in re.search(r'points="([^"]+)"', svg).group(1).split()]
-    assert len(drawn) <= charts.MOST_POINTS + 1
+    assert len(drawn) <= charts.MAX_POINTS + 1
     assert all(charts.LEFT <= x <= charts.WIDTH and 0 <= y <= charts.HEIGHT for x, y in drawn)
     assert all(b[0] > a[0] and b[1] >= a[1] for a, b in itertools.pairwise(drawn))
     assert "<b>0.0002</b>" in svg

@@ -8,19 +8,20 @@ from pathlib import Path
 from finished_runs import make_run
 from PIL import Image
 
-from gsopt.results.report import posed, write_report
+from gsopt.results.report import write_report
+from gsopt.results.report.cameras_section import cameras_section
 
 EVIL = "<script>alert('x')</script>"
 
 
-def told(run: Path) -> str:
+def cameras_html(run: Path) -> str:
     messages: list[str] = []
-    text = posed.section(run.parent / "data", run, messages)
+    text = cameras_section(run.parent / "data", run, messages)
     return text + "".join(messages)
 
 
 def test_poses_that_were_given_are_not_talked_about(tmp_path: Path) -> None:
-    assert told(make_run(tmp_path, train=1, test=0)) == ""
+    assert cameras_html(make_run(tmp_path, train=1, test=0)) == ""
 
 
 def test_what_sfm_said_and_drew_stands_on_the_page(tmp_path: Path) -> None:
@@ -39,7 +40,7 @@ def test_corrected_poses_are_summed_up(tmp_path: Path) -> None:
     run = make_run(tmp_path, train=1, test=0)
     views = [{"turned_degrees": value} for value in (0.1, 0.5, 0.3)]
     (run / "poses.json").write_text(json.dumps({"views": views}))
-    assert "turned 3 input views by 0.300 degrees (median), 0.500 at most" in told(run)
+    assert "turned 3 input views by 0.300 degrees (median), 0.500 at most" in cameras_html(run)
 
 
 def test_broken_files_are_named_and_hostile_values_vanish(tmp_path: Path) -> None:
@@ -47,7 +48,7 @@ def test_broken_files_are_named_and_hostile_values_vanish(tmp_path: Path) -> Non
     (tmp_path / "data/sfm.json").write_text("{")
     (tmp_path / "data/sfm.png").write_bytes(b"no picture")
     (run / "poses.json").write_text(json.dumps({"views": [EVIL, {"turned_degrees": 1e300}, {"turned_degrees": None}]}))
-    text = told(run)
+    text = cameras_html(run)
     assert "sfm.json is not valid JSON" in text
     assert "by 0.000 degrees" in text
     assert "<script" not in text

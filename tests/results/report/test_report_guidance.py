@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from gsopt.results.report.guided import section
+from gsopt.results.report.guidance_section import guidance_section
 
-TOLD = {
+SUMMARY = {
     "model": "toy <b>prior</b>",
     "policy": "recon",
     "lambda_sds": 0.2,
@@ -25,10 +25,10 @@ TOLD = {
 }
 
 
-def write(run: Path, told: object) -> Path:
+def write(run: Path, summary: object) -> Path:
     folder = run / "guidance"
     folder.mkdir(parents=True)
-    (folder / "summary.json").write_text(told if isinstance(told, str) else json.dumps(told))
+    (folder / "summary.json").write_text(summary if isinstance(summary, str) else json.dumps(summary))
     for view in (3, 17):
         for when in ("before", "after"):
             Image.new("RGB", (8, 8), "red").save(folder / f"{when}_{view:02d}.png")
@@ -40,7 +40,7 @@ def write(run: Path, told: object) -> Path:
 
 def test_it_says_and_shows_what_guidance_did(tmp_path: Path) -> None:
     messages: list[str] = []
-    html = section(write(tmp_path, TOLD), messages)
+    html = guidance_section(write(tmp_path, SUMMARY), messages)
     assert messages == []
     assert "31 of 40 steps" in html
     assert "8 were left alone" in html
@@ -51,24 +51,24 @@ def test_it_says_and_shows_what_guidance_did(tmp_path: Path) -> None:
 
 
 def test_it_says_the_weight_that_the_guard_left(tmp_path: Path) -> None:
-    halved = {**TOLD, "guard": {"factor": 0.5, "reason": "tried twice"}}
-    assert "lambda 0.1 (tried twice)" in section(write(tmp_path, halved), [])
+    halved = {**SUMMARY, "guard": {"factor": 0.5, "reason": "tried twice"}}
+    assert "lambda 0.1 (tried twice)" in guidance_section(write(tmp_path, halved), [])
 
 
 def test_a_run_without_guidance_has_no_such_part(tmp_path: Path) -> None:
-    assert section(tmp_path, []) == ""
+    assert guidance_section(tmp_path, []) == ""
 
 
-@pytest.mark.parametrize("told", ["{", "[]", '{"views": "x"}', '{"views": [1e99, "../../etc", -1], "samples": [7]}'])
-def test_what_is_broken_is_left_out(told: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("summary", ["{", "[]", '{"views": "x"}', '{"views": [1e99, "../../etc", -1], "samples": [7]}'])
+def test_what_is_broken_is_left_out(summary: str, tmp_path: Path) -> None:
     messages: list[str] = []
-    html = section(write(tmp_path, told), messages)
+    html = guidance_section(write(tmp_path, summary), messages)
     assert "<img" not in html
-    assert bool(messages) == (told in ("{", "[]"))
+    assert bool(messages) == (summary in ("{", "[]"))
 
 
 def test_a_picture_that_is_none_is_left_out(tmp_path: Path) -> None:
-    run = write(tmp_path, TOLD)
+    run = write(tmp_path, SUMMARY)
     (run / "guidance" / "before_03.png").write_bytes(b"no picture")
     (run / "guidance" / "step_000012_proposal.png").unlink()
-    assert section(run, []).count("<img") == 2 * 4 + 3 - 2
+    assert guidance_section(run, []).count("<img") == 2 * 4 + 3 - 2

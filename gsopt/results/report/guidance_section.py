@@ -11,12 +11,12 @@ from PIL import Image
 
 from gsopt.data.files import is_regular, read_json
 from gsopt.errors import InputError
-from gsopt.results.report.pictures import data_uri, read_picture
+from gsopt.results.report.embedded_images import data_uri, read_image
 
-SIDE = 256
-MOST = 8
+IMAGE_SIDE = 256
+MAX_ROWS = 8
 """Rows of pictures that are read of each kind."""
-LARGEST = 2048 * 2048
+MAX_PIXELS = 2048 * 2048
 BEFORE_AFTER = ("before", "before_uncertainty", "after", "after_uncertainty")
 PROPOSAL = ("render", "proposal", "uncertainty")
 
@@ -24,43 +24,43 @@ Row = tuple[str, list[Image.Image | None]]
 """A line of text and the pictures above it."""
 
 
-def section(run: Path, messages: list[str]) -> str:
+def guidance_section(run: Path, messages: list[str]) -> str:
     """Empty for a run without guidance. What cannot be read is left out and said in `messages`."""
     folder = run / "guidance"
     if not is_regular(folder / "summary.json"):
         return ""
     try:
-        told = read_json(folder / "summary.json")
+        summary = read_json(folder / "summary.json")
     except InputError as error:
         messages.append(f"What guidance did cannot be shown. {error}")
         return ""
-    views = [_view(folder, view) for view in _numbers(told.get("views"))]
-    steps = [_step(folder, sample) for sample in _objects(told.get("samples"))]
+    views = [_view(folder, view) for view in _numbers(summary.get("views"))]
+    steps = [_step(folder, sample) for sample in _objects(summary.get("samples"))]
     return (
-        f"<section><h2>Guidance</h2><p>{escape(counts(told))}</p>"
+        f"<section><h2>Guidance</h2><p>{escape(summary_text(summary))}</p>"
         + _cards("Least known views before the first guided step and at the end", BEFORE_AFTER, views)
         + _cards("What the prior was shown, and what it proposed", PROPOSAL, steps)
         + "</section>\n"
     )
 
 
-def counts(told: dict[str, Any]) -> str:
+def summary_text(summary: dict[str, Any]) -> str:
     """How many steps were guided, why others were not, and by what."""
-    guided, wanted, decided, failed = (_whole(told.get(key)) for key in ("guided", "wanted", "decided", "failed"))
-    guard = told.get("guard")
+    guided, wanted, decided, failed = (_whole(summary.get(key)) for key in ("guided", "wanted", "decided", "failed"))
+    guard = summary.get("guard")
     reason = guard.get("reason") if isinstance(guard, dict) else None
-    weight, factor = told.get("lambda_sds"), guard.get("factor", 1.0) if isinstance(guard, dict) else 1.0
+    weight, factor = summary.get("lambda_sds"), guard.get("factor", 1.0) if isinstance(guard, dict) else 1.0
     if isinstance(weight, int | float) and isinstance(factor, int | float):
         weight = f"{weight * factor:g}"
     sentences = [
-        f"{told.get('model', 'A diffusion prior')}, policy {told.get('policy', 'unknown')}, "
+        f"{summary.get('model', 'A diffusion prior')}, policy {summary.get('policy', 'unknown')}, "
         f"lambda {'unknown' if weight is None else weight}" + (f" ({reason})." if reason else "."),
         f"{guided} of {wanted} steps that the schedule wanted guided were guided.",
     ]
     if decided:
         sentences.append(f"{decided} were left alone because the input views decide everywhere.")
     if failed:
-        sentences.append(f"{failed} failed." + (" After that the run went on without." if told.get("ended") else ""))
+        sentences.append(f"{failed} failed." + (" After that the run went on without." if summary.get("ended") else ""))
     return " ".join(sentences)
 
 
@@ -77,7 +77,7 @@ def _step(folder: Path, sample: dict[str, Any]) -> Row:
 
 
 def _pictures(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
-    return [read_picture(folder / f"{name}.png", SIDE, LARGEST) for name in names]
+    return [read_image(folder / f"{name}.png", IMAGE_SIDE, MAX_PIXELS) for name in names]
 
 
 def _cards(title: str, kinds: Iterable[str], rows: list[Row]) -> str:
@@ -103,8 +103,8 @@ def _whole(value: object) -> int:
 
 
 def _numbers(value: object) -> list[int]:
-    return [_whole(item) for item in value[:MOST]] if isinstance(value, list) else []
+    return [_whole(item) for item in value[:MAX_ROWS]] if isinstance(value, list) else []
 
 
 def _objects(value: object) -> list[dict[str, Any]]:
-    return [item for item in value[:MOST] if isinstance(item, dict)] if isinstance(value, list) else []
+    return [item for item in value[:MAX_ROWS] if isinstance(item, dict)] if isinstance(value, list) else []

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from gsopt.data.files import is_regular
-from gsopt.results.video import write_film
+from gsopt.results.video import write_video
 
 QUALITY = 88
 ERROR_FULL_SCALE = 0.25
@@ -33,13 +33,13 @@ def shrunk(image: Image.Image, side: int) -> Image.Image:
     return copy
 
 
-def read_picture(path: Path, side: int, most_pixels: int) -> Image.Image | None:
+def read_image(path: Path, side: int, max_pixels: int) -> Image.Image | None:
     """A PNG made to fit into a square of `side` px; None for a file that is missing, too large or no picture."""
     if not is_regular(path):
         return None
     try:
         with Image.open(path, formats=("PNG",)) as image:
-            return shrunk(image.convert("RGB"), side) if image.width * image.height <= most_pixels else None
+            return shrunk(image.convert("RGB"), side) if image.width * image.height <= max_pixels else None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
 
@@ -51,10 +51,10 @@ def data_uri(image: Image.Image) -> str:
     return _uri(buffer.getvalue())
 
 
-def film_uri(images: Sequence[Image.Image], fps: float) -> str:
+def animation_uri(images: Sequence[Image.Image], fps: float) -> str:
     """An endless animated WebP as a data URI."""
     buffer = io.BytesIO()
-    write_film(buffer, iter(images), ".webp", fps)
+    write_video(buffer, iter(images), ".webp", fps)
     return _uri(buffer.getvalue())
 
 
@@ -67,10 +67,13 @@ def error_map(render: Image.Image, truth: Image.Image) -> Image.Image:
     return Image.fromarray(np.stack(channels, axis=2).round().astype(np.uint8))
 
 
-def error_gradient() -> str:
-    """The color scale as a CSS gradient."""
+def error_legend() -> str:
+    """The color scale of `error_map` as HTML."""
     stops = ", ".join(f"rgb({red} {green} {blue}) {at:.0%}" for at, red, green, blue in ERROR_COLORS)
-    return f"linear-gradient(90deg, {stops})"
+    return (
+        f'<p class="legend"><span>Error 0</span><i style="background:linear-gradient(90deg, {stops})"></i>'
+        f"<span>{ERROR_FULL_SCALE:g} and more (mean absolute difference of the channels, of 1)</span></p>"
+    )
 
 
 def _uri(data: bytes) -> str:

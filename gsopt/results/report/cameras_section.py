@@ -9,30 +9,30 @@ from typing import Any
 
 from gsopt.data.files import is_regular, read_json
 from gsopt.errors import InputError
-from gsopt.results.report.pictures import data_uri, read_picture
+from gsopt.results.report.embedded_images import data_uri, read_image
 
-SIDE = 1440
-LARGEST = 4096 * 4096
-MOST_LINES = 40
+IMAGE_SIDE = 1440
+MAX_PIXELS = 4096 * 4096
+MAX_LINES = 40
 
 
-def section(dataset: Path, run: Path, messages: list[str]) -> str:
+def cameras_section(dataset: Path, run: Path, messages: list[str]) -> str:
     """Empty where the poses were given and kept. What cannot be read is left out and said in `messages`."""
-    lines = [*_found(dataset / "sfm.json", messages), *_refined(run / "poses.json", messages)]
-    picture = read_picture(dataset / "sfm.png", SIDE, LARGEST)
+    lines = [*_sfm_lines(dataset / "sfm.json", messages), *_refinement_lines(run / "poses.json", messages)]
+    picture = read_image(dataset / "sfm.png", IMAGE_SIDE, MAX_PIXELS)
     if not lines and picture is None:
         return ""
     drawn = "" if picture is None else f'<img src="{data_uri(picture)}" style="width:100%" alt="Cameras and points">'
     return f"<section><h2>Cameras</h2>{''.join(f'<p>{escape(line)}</p>' for line in lines)}{drawn}</section>\n"
 
 
-def _found(path: Path, messages: list[str]) -> list[str]:
+def _sfm_lines(path: Path, messages: list[str]) -> list[str]:
     """The report of `gsopt sfm` as it was printed."""
     lines = _read(path, messages).get("report")
-    return [line.strip() for line in lines[:MOST_LINES] if isinstance(line, str)] if isinstance(lines, list) else []
+    return [line.strip() for line in lines[:MAX_LINES] if isinstance(line, str)] if isinstance(lines, list) else []
 
 
-def _refined(path: Path, messages: list[str]) -> list[str]:
+def _refinement_lines(path: Path, messages: list[str]) -> list[str]:
     views = _read(path, messages).get("views")
     turned = [_degrees(view) for view in views] if isinstance(views, list) else []
     if not turned:

@@ -16,21 +16,22 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
 from gsopt.events import LARGEST_METRICS, read_events
 from gsopt.geometry.cameras import Cameras
-from gsopt.results.finished_run import FinishedRun, film_path, fitted, open_run, truth
-from gsopt.results.report import guided, posed
-from gsopt.results.report.pictures import shrunk
+from gsopt.results.finished_run import FinishedRun, camera_path, open_run, truth, with_longest_side
+from gsopt.results.report.cameras_section import cameras_section
+from gsopt.results.report.embedded_images import shrunk
+from gsopt.results.report.guidance_section import guidance_section
 from gsopt.results.video import as_image
 
-JUDGED_SHOWN = 12
-EXTREMES_SHOWN = 4
-INPUTS_SHOWN = 24
+MAX_EVALUATED_VIEWS = 12
+EXTREME_VIEWS = 4
+MAX_INPUT_VIEWS = 24
 TURNTABLE_FRAMES = 36
 TURNTABLE_SIDE = 400
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluatedView:
     """One view that the figures are about."""
 
     name: str
@@ -65,10 +66,10 @@ class Report:
     messages: list[str]
     """Warnings and errors of the run, then what the report itself could not do."""
     held_out: bool = True
-    """Whether `judged` and the figures are about views the run did not learn from."""
+    """Whether `evaluated` and the figures are about views the run did not learn from."""
     mean: dict[str, float | None] = field(default_factory=dict)
     per_view: list[dict[str, Any]] = field(default_factory=list)
-    judged: list[Judged] = field(default_factory=list)
+    evaluated: list[EvaluatedView] = field(default_factory=list)
     inputs: list[tuple[str, Image.Image]] = field(default_factory=list)
     input_count: int | None = None
     test_count: int | None = None
@@ -83,7 +84,7 @@ class Report:
 
 
 @torch.no_grad()
-def gather(run: Path, config: TrainConfig) -> Report:
+def read_run(run: Path, config: TrainConfig) -> Report:
     """Read and draw what is there. Each part that cannot be had leaves a message instead."""
     messages: list[str] = []
     events = _events(run, messages)
@@ -96,14 +97,14 @@ def gather(run: Path, config: TrainConfig) -> Report:
         messages=messages,
     )
     messages += [text for event in events if (text := _message(event)) is not None]
-    report.guidance = guided.section(run, messages)
-    report.cameras = posed.section(Path(config.data.path), run, messages)
-    _take_figures(report)
+    report.guidance = guidance_section(run, messages)
+    report.cameras = cameras_section(Path(config.data.path), run, messages)
+    _add_figures(report)
     try:
         scene = load_scene(config.data)
-        _take_inputs(report, scene)
+        _add_inputs(report, scene)
         finished = open_run(run)
-        _take_drawings(report, finished, scene)
+        _add_renders(report, finished, scene)
     except GsoptError as error:
         messages.append(f"Some pictures are missing from this report. {error}")
     return report
@@ -118,27 +119,27 @@ def number(value: object) -> float | None:
 
 def progress_of(events: Sequence[dict[str, Any]]) -> list[Progress]:
     """The course of a run. Where a resumed run went back to a checkpoint, what it took back is left out."""
-    course: list[Progress] = []
+    progress_charts: list[Progress] = []
     for event in events:
         step = number(event.get("step"))
         if event.get("kind") != "progress" or step is None:
             continue
-        while course and course[-1].step >= step:
-            course.pop()
+        while progress_charts and progress_charts[-1].step >= step:
+            progress_charts.pop()
         seconds, loss, psnr, n = (number(event.get(key)) for key in ("seconds", "loss", "psnr", "n"))
-        course.append(Progress(step, seconds, loss, psnr, n))
-    return course
+        progress_charts.append(Progress(step, seconds, loss, psnr, n))
+    return progress_charts
 
 
-def chosen(psnrs: Sequence[float]) -> list[int]:
+def representative_rows(psnrs: Sequence[float]) -> list[int]:
     """Rows to show, from worst to best: the extremes at both ends and an even choice of those between."""
     order = sorted(range(len(psnrs)), key=lambda row: psnrs[row])
-    if len(order) <= JUDGED_SHOWN:
+    if len(order) <= MAX_EVALUATED_VIEWS:
         return order
-    between = order[EXTREMES_SHOWN:-EXTREMES_SHOWN]
-    count = JUDGED_SHOWN - 2 * EXTREMES_SHOWN
+    between = order[EXTREME_VIEWS:-EXTREME_VIEWS]
+    count = MAX_EVALUATED_VIEWS - 2 * EXTREME_VIEWS
     spread = [between[(2 * i + 1) * len(between) // (2 * count)] for i in range(count)]
-    return order[:EXTREMES_SHOWN] + spread + order[-EXTREMES_SHOWN:]
+    return order[:EXTREME_VIEWS] + spread + order[-EXTREME_VIEWS:]
 
 
 def _events(run: Path, messages: list[str]) -> list[dict[str, Any]]:
@@ -168,7 +169,7 @@ def _read_object(path: Path, messages: list[str]) -> dict[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-def _take_figures(report: Report) -> None:
+def _add_figures(report: Report) -> None:
     """Means and rows of the held-out views; where there are none, of the training views, marked as such."""
     source = report.metrics
     if not isinstance(source.get("mean"), dict) and isinstance(source.get("train"), dict):
@@ -186,29 +187,29 @@ def _take_figures(report: Report) -> None:
     report.steps = None if steps is None else int(steps)
 
 
-def _take_inputs(report: Report, scene: Scene) -> None:
+def _add_inputs(report: Report, scene: Scene) -> None:
     background = torch.ones(3)
-    shown = min(INPUTS_SHOWN, len(scene.train))
+    shown = min(MAX_INPUT_VIEWS, len(scene.train))
     views = [scene.train[i * len(scene.train) // shown] for i in range(shown)]
     report.inputs = [(view.name, shrunk(as_image(truth(view, background)), 200)) for view in views]
     report.input_count, report.test_count = len(scene.train), len(scene.test)
 
 
-def _take_drawings(report: Report, finished: FinishedRun, scene: Scene) -> None:
+def _add_renders(report: Report, finished: FinishedRun, scene: Scene) -> None:
     report.n_gaussians, report.backend = len(finished.gaussians), finished.backend.name
     views = {view.name: view for view in (scene.test if report.held_out else scene.train)}
     rows = [row for row in report.per_view if row["name"] in views and row["psnr"] is not None]
-    order = chosen([row["psnr"] for row in rows])
+    order = representative_rows([row["psnr"] for row in rows])
     for place, index in enumerate(order):
         badge = {0: "worst", len(order) - 1: "best"}.get(place, "") if len(order) > 1 else ""
-        report.judged.append(_judged(finished, views[rows[index]["name"]], rows[index], badge))
+        report.evaluated.append(_evaluated_view(finished, views[rows[index]["name"]], rows[index], badge))
     size = scene.train[0].camera
     cameras = Cameras.cat([view.camera.resized(size.width, size.height) for view in scene.train])
-    film = film_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
+    film = camera_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
     side = min(TURNTABLE_SIDE, 2 * max(size.width, size.height))
-    report.turntable = [as_image(finished.draw(fitted(film[i], side))) for i in range(len(film))]
+    report.turntable = [as_image(finished.draw(with_longest_side(film[i], side))) for i in range(len(film))]
 
 
-def _judged(finished: FinishedRun, view: View, row: dict[str, Any], badge: str) -> Judged:
+def _evaluated_view(finished: FinishedRun, view: View, row: dict[str, Any], badge: str) -> EvaluatedView:
     picture, target = as_image(finished.draw(view.camera)), as_image(truth(view, finished.background))
-    return Judged(view.name, badge, {key: row[key] for key in METRICS}, picture, target)
+    return EvaluatedView(view.name, badge, {key: row[key] for key in METRICS}, picture, target)

@@ -11,11 +11,11 @@ from importlib import resources
 from PIL import Image
 
 from gsopt._version import __version__
+from gsopt.results.report.embedded_images import data_uri
 from gsopt.results.report.page import POLICY
-from gsopt.results.report.pictures import data_uri
 
-NOTHING = "\N{EN DASH}"
-CLEAR = 0.05
+NO_VALUE = "\N{EN DASH}"
+MIN_LEAD = 0.05
 """dB by which a set of prompts has to lead to be called the best."""
 
 
@@ -56,13 +56,13 @@ def comparison_page(
 
 def _table(views: Sequence[str], columns: Sequence[Column]) -> str:
     means = sorted((column.mean for column in columns), reverse=True)
-    best = means[0] if len(means) == 1 or means[0] - means[1] >= CLEAR else math.inf
+    best = means[0] if len(means) == 1 or means[0] - means[1] >= MIN_LEAD else math.inf
     head = "".join(f"<th>{escape(view)}</th>" for view in (f"to {columns[0].name}", *views))
     rows = []
     for column in columns:
         badge = ' <span class="badge best">best</span>' if column.mean == best else ""
         figures = "".join(f"<td>{value:.2f}</td>" for value in column.psnrs)
-        aligned = NOTHING if column.alignment is None else f"{column.alignment:.3f}"
+        aligned = NO_VALUE if column.alignment is None else f"{column.alignment:.3f}"
         rows.append(
             f"<tr><th>{escape(column.name)}{badge}</th><td>{column.mean:.2f}</td>"
             f"<td>{column.mean - columns[0].mean:+.2f}</td>{figures}<td>{aligned}</td></tr>"
