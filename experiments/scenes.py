@@ -1,4 +1,4 @@
-"""Trains the scenes the README quotes and records what came out.
+"""Trains the scenes that README.md and docs/performance.md quote and records their figures.
 
     python experiments/scenes.py --root DATA [--case lego-100 ...] [--runs FOLDER]
 

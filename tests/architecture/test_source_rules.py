@@ -13,7 +13,7 @@ import gsopt.errors
 
 LONGEST_FILE = 400
 MOST_STATEMENTS = 40
-CODE = {".py", ".cpp", ".cu", ".h"}
+CODE = {".py", ".cpp", ".h"}
 BANNED_MODULES = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve"}
 BANNED_CALLS = {"eval", "exec"}
 BANNED_ATTRIBUTES = {"nan_to_num", "nan_to_num_"}
