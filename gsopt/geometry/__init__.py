@@ -1,1 +1,1 @@
-"""Mathematics that several packages share: cameras, rotations, projection, voxels, harmonics."""
+"""Mathematics that several packages share: cameras, paths, focus, projection, rotations, harmonics, voxels, Z-order."""

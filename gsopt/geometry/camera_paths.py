@@ -15,63 +15,38 @@ from torch import Tensor
 from gsopt import check
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras, look_at
+from gsopt.geometry.focus import nearest_to_axes, up_direction
 
 FOCUS_DAMPING = 1e-3
-"""Pull of the focus towards the cameras, relative to an axis's pull towards itself; matters for parallel axes only."""
-ROLL_DAMPING = 1e-3
-"""Pull of the up direction towards the mean of the cameras'; matters where they look the same way.
-
-It tilts a well-settled up by about 1e-4; less of it would let the roll of a shaky hand decide in a narrow capture."""
+"""Damping of `nearest_to_axes`. Stronger than that of `find_focus`: a film stays near cameras whose axes differ by less
+than 2 degrees, instead of going around a point far off."""
 LEAST_SWING = math.radians(15)
+"""Half the least angle of a turntable's swing."""
 ELLIPSE_QUANTILE = 0.9
+"""Share of the cameras inside the half axes."""
 ELLIPSE_FLATTEST = 0.25
 """Least ratio of the two half axes: a row of cameras still gives a path around the subject."""
 
 
 def focus_point(cameras: Cameras) -> Float[Tensor, "3"]:
-    """The point with the least sum of squared distances to the viewing axes.
-
-    A weak pull towards the cameras' mean settles what the axes leave open: one camera, or parallel ones.
-    """
-    _need_one(cameras)
-    centers, axes = cameras.centers.double(), cameras.forwards.double()
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    middle = centers.mean(0)
-    normal = across.mean(0) + FOCUS_DAMPING * torch.eye(3, dtype=torch.float64)
-    return middle + torch.linalg.solve(normal, (across @ (centers - middle)[..., None]).mean(0)[:, 0])
-
-
-def up_direction(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Unit vector closest to perpendicular to all horizontal image axes: the world's up if nobody tilts the camera.
-
-    Unlike the mean of the cameras' up it does not lean when all of them look down from one side. Where the horizontal
-    axes leave it open, or contradict the mean up by more than 60 degrees, the mean up decides.
-    """
-    _need_one(cameras)
-    right, up = cameras.viewmats[:, 0, :3].double(), -cameras.viewmats[:, 1, :3].double()
-    mean = up.mean(0)
-    mean = mean / mean.norm() if mean.norm() > 1e-6 else up[0] / up[0].norm()
-    identity = torch.eye(3, dtype=torch.float64)
-    cost = (right[:, :, None] * right[:, None, :]).mean(0) + ROLL_DAMPING * (identity - torch.outer(mean, mean))
-    level = torch.linalg.eigh(cost).eigenvectors[:, 0]
-    level = level if level @ mean > 0 else -level
-    return level if float(level @ mean) > 0.5 else mean
+    """The point with the least sum of squared distances to the viewing axes, near the cameras if they are parallel."""
+    return nearest_to_axes(cameras.centers.double(), cameras.forwards.double(), FOCUS_DAMPING)
 
 
 def orbit_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None = None) -> Cameras:
     """`count` cameras on one circle around the focus, at the cameras' mean distance and elevation.
 
     It begins at the first camera's azimuth and ends one step before it comes round again. `focus`: scene units,
-    `focus_point` when not given (with a single camera it should be given: one axis does not say how far to look).
+    `focus_point` when not given (with a single camera it should be given: one axis leaves the distance open).
     """
     check.at_least("count", count, 1, "Give the number of frames.")
     return _on_circle(cameras, _turn(count), _focus(cameras, focus))
 
 
 def turntable_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None = None) -> Cameras:
-    """The orbit where the cameras stand all around; else a swing to and fro on the side they saw, at least 15 degrees.
+    """An orbit when the cameras stand all around; else a swing to and fro on their side, at least 15 degrees.
 
-    All around: no gap of more than half a turn between their azimuths. What nobody photographed is not worth a film.
+    All around: no gap of more than half a turn between their azimuths. A film shows no side that no photo does.
     """
     check.at_least("count", count, 1, "Give the number of frames.")
     focus = _focus(cameras, focus)
@@ -89,7 +64,7 @@ def ellipse_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None 
     their spread; height: their mean. Frames are evenly spaced along the ellipse.
     """
     check.at_least("count", count, 1, "Give the number of frames.")
-    up, focus = up_direction(cameras), _focus(cameras, focus)
+    focus, up = _focus(cameras, focus), up_direction(cameras.viewmats)
     offsets = cameras.centers.double() - focus
     flat = torch.stack(_horizontal_axes(offsets[0], up))
     plane = offsets @ flat.T
@@ -104,7 +79,7 @@ def ellipse_path(cameras: Cameras, count: int, focus: Float[Tensor, "3"] | None 
 def interpolated_path(cameras: Cameras, count: int) -> Cameras:
     """`count` cameras from the first to the last through all in between, in their order, in equal parameter steps.
 
-    Positions follow a Catmull-Rom spline, rotations the chordal mean of two neighbours, intrinsics a straight line.
+    Positions follow a Catmull-Rom spline, rotations the chordal mean of two neighbors, intrinsics a straight line.
     """
     _need_one(cameras)
     check.at_least("count", count, 1, "Give the number of frames.")
@@ -132,7 +107,7 @@ def _turn(count: int) -> Float[Tensor, " count"]:
 
 def _on_circle(cameras: Cameras, azimuths: Float[Tensor, " N"], focus: Float[Tensor, "3"]) -> Cameras:
     """Cameras at the mean distance and elevation, azimuths counted from the first camera."""
-    up, offsets = up_direction(cameras), cameras.centers.double() - focus
+    up, offsets = up_direction(cameras.viewmats), cameras.centers.double() - focus
     distances = offsets.norm(dim=1).clamp_min(1e-9)
     elevation = float(torch.asin(((offsets @ up) / distances).clamp(-1, 1)).mean())
     ahead, aside = _horizontal_axes(offsets[0], up)
@@ -144,7 +119,7 @@ def _on_circle(cameras: Cameras, azimuths: Float[Tensor, " N"], focus: Float[Ten
 def _covered_arc(cameras: Cameras, focus: Float[Tensor, "3"]) -> tuple[float, float]:
     """(start, width) of the shortest arc that holds every camera's azimuth, radians from the first camera."""
     offsets = cameras.centers.double() - focus
-    ahead, aside = _horizontal_axes(offsets[0], up_direction(cameras))
+    ahead, aside = _horizontal_axes(offsets[0], up_direction(cameras.viewmats))
     azimuths = torch.atan2(offsets @ aside, offsets @ ahead).sort().values
     gaps = torch.cat([azimuths[1:], azimuths[:1] + 2 * math.pi]) - azimuths
     widest = int(gaps.argmax())
@@ -157,6 +132,7 @@ def _need_one(cameras: Cameras) -> None:
 
 
 def _focus(cameras: Cameras, focus: Tensor | None) -> Float[Tensor, "3"]:
+    _need_one(cameras)
     return focus_point(cameras) if focus is None else focus.double()
 
 

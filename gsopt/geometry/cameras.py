@@ -11,9 +11,10 @@ from torch import Tensor
 
 from gsopt import check
 
-# Negates y and z: cameras of OpenGL and Blender (x right, y up, looking along -z) to OpenCV and back.
-# This is the only place in the project where that flip is written down.
 OPENCV_FROM_OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+"""Negates y and z: cameras of OpenGL and Blender (x right, y up, looking along -z) to OpenCV and back.
+
+No other place in the project writes that flip down."""
 
 
 def viewmats_from_opengl(world_from_cam: Float[Tensor, "*C 4 4"]) -> Float[Tensor, "*C 4 4"]:
@@ -30,7 +31,7 @@ def opengl_from_viewmats(viewmats: Float[Tensor, "*C 4 4"]) -> Float[Tensor, "*C
 
 @dataclass(frozen=True)
 class Cameras:
-    """C pinhole cameras that share one image size. Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)."""
+    """C pinhole cameras that share one image size. Pixel (column i, row j) has its center at (i + 0.5, j + 0.5)."""
 
     viewmats: Float[Tensor, "C 4 4"]
     """cam_from_world, OpenCV axes."""

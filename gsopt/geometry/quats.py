@@ -1,4 +1,4 @@
-"""Quaternions wxyz: to and from rotation matrices, product, conjugate. Any norm > 0 stands for the same rotation."""
+"""Quaternions wxyz: to and from rotation matrices, product, conjugate. Any norm > 0 gives the same rotation."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def rotation_matrices(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
 
 
 def from_rotation_matrices(matrices: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 4"]:
-    """Unit quaternions with w >= 0. Of the four expressions for q, each divided by 2 |q_i|, the one with the largest
-    q_i is taken, which never divides by less than 1 (Shepperd 1978)."""
+    """Unit quaternions with w >= 0. Each row of `outer` is 4 q_i q; the row with the largest q_i loses no
+    digits (Shepperd 1978)."""
     m = matrices
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]

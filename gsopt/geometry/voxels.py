@@ -1,4 +1,4 @@
-"""A box of cubic voxels, and neighbours in it."""
+"""A box of cubic voxels, and neighbors in it."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class Grid:
     """Edge, scene units."""
 
     def centers(self, cells: Bool[Tensor, "X Y Z"] | None = None) -> Float[Tensor, "M 3"]:
-        """Of the true cells; of the occupied ones when not given."""
+        """Centers of the true cells; of the occupied ones when not given."""
         return self.low + (torch.nonzero(self.occupied if cells is None else cells) + 0.5) * self.voxel
 
     def surface(self) -> Float[Tensor, "M 3"]:
-        """Centres of the occupied voxels that have one of their 26 neighbours free."""
+        """Centers of the occupied voxels that have one of their 26 neighbors free."""
         return self.centers(self.occupied & ~eroded(self.occupied))
 
 
 def dilated(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
-    """With the 26 neighbours of every true voxel; one axis after the other."""
+    """With the 26 neighbors of every true voxel; one axis after the other."""
     for axis in range(3):
         wider, size = cells.clone(), cells.shape[axis]
         wider.narrow(axis, 1, size - 1).logical_or_(cells.narrow(axis, 0, size - 1))
@@ -39,5 +39,5 @@ def dilated(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
 
 
 def eroded(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
-    """Without the voxels that have one of their 26 neighbours outside, the grid's border included."""
+    """Without the voxels that have one of their 26 neighbors outside, the grid's border included."""
     return ~dilated(torch.nn.functional.pad(~cells, (1,) * 6, value=True))[1:-1, 1:-1, 1:-1]

@@ -13,7 +13,7 @@ from gsopt.config.train import InitConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
 from gsopt.gaussians import Gaussians
-from gsopt.geometry.projection import find_focus
+from gsopt.geometry.focus import find_focus
 from gsopt.init.frustum import random_points
 from gsopt.init.hull import hull_points
 from gsopt.init.points import gaussians_at

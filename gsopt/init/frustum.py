@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.geometry.cameras import Cameras
-from gsopt.geometry.projection import Focus, sees
+from gsopt.geometry.focus import Focus
+from gsopt.geometry.projection import sees
 
 BACKGROUND_SHARE = 0.3
 """Share of the points beyond the common region, where the scene has a background (no alpha)."""

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gsopt.data.scene import Scene
 from gsopt.geometry.cameras import Cameras
-from gsopt.geometry.projection import Focus, find_focus, inside, project
+from gsopt.geometry.focus import Focus, find_focus
+from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated, eroded
 from gsopt.init.rounded_hull import rounded
 from gsopt.init.surface_colors import unoccluded_colors

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.data.scene import View
-from gsopt.geometry.camera_paths import interpolated_path, up_direction
+from gsopt.geometry.camera_paths import interpolated_path
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
-from gsopt.geometry.projection import find_focus
+from gsopt.geometry.focus import find_focus, up_direction
 from gsopt.sds.priors.protocol import References
 
 AZIMUTHS = 12
@@ -88,7 +88,7 @@ def make_rig(inputs: Sequence[Cameras], extent: float, size: int, front: Cameras
     """Rings of cameras around the subject; between the inputs where their axes do not meet."""
     focus = find_focus(list(inputs), extent)
     same = Cameras.cat([square(camera, size) for camera in inputs])
-    up = up_direction(same)
+    up = up_direction(same.viewmats)
     centers = same.centers.double() - focus.point.double()
     ahead = _level(front.centers[0].double() - focus.point.double(), up)
     lengths = centers.norm(dim=1)

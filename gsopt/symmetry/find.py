@@ -10,7 +10,7 @@ import torch
 
 from gsopt.data.scene import Scene, View
 from gsopt.errors import InputError
-from gsopt.geometry.projection import find_focus
+from gsopt.geometry.focus import find_focus
 from gsopt.geometry.voxels import Grid
 from gsopt.init.hull import carve, in_hull
 from gsopt.init.thumbnails import Photo, small_photos

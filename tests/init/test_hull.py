@@ -13,7 +13,8 @@ from gsopt.config.train import InitConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import UsageError
 from gsopt.geometry.cameras import Cameras
-from gsopt.geometry.projection import find_focus, sees
+from gsopt.geometry.focus import find_focus
+from gsopt.geometry.projection import sees
 from gsopt.init import first_gaussians
 from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
 from gsopt.init.thumbnails import Photo, small_photos

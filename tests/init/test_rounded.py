@@ -10,7 +10,7 @@ from shapes import ellipsoid_scene, spread_cameras
 
 from gsopt.data.scene import load_scene
 from gsopt.geometry.cameras import Cameras
-from gsopt.geometry.projection import find_focus
+from gsopt.geometry.focus import find_focus
 from gsopt.geometry.voxels import Grid
 from gsopt.init.hull import carve
 from gsopt.init.rounded_hull import FAR, RATIO, rounded, squared_distance, thickest, thickness

@@ -1,4 +1,4 @@
-"""Where the world's axes go: z up, the cameras' common focus at the origin, their typical distance to it 1.
+"""The axes of a found scene: z up, the cameras' common focus at the origin, their typical distance to it 1.
 
 Structure from motion leaves position, orientation and scale open. The similarity chosen here is recorded with the
 scene, so that it can be taken back: x_placed = scale · rotation · x_found + translation.
@@ -9,10 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-FLAT = 0.02
-"""Below this share of the cameras' x axes in a second direction, all look the same way and tell no horizon."""
+from gsopt.geometry.focus import across_axes, nearest_to_axes, up_direction
+
+PARALLEL_SHARE = 0.02
+"""Share of the cameras' x axes in a second direction below which all look the same way and fix no horizon."""
 
 
 @dataclass(frozen=True)
@@ -37,38 +40,34 @@ class Similarity:
 
 def place(viewmats: Float[np.ndarray, "C 4 4"], points: Float[np.ndarray, "P 3"]) -> Similarity:
     """The similarity for cameras (cam_from_world, OpenCV axes) and the points they saw."""
-    rotation = rotation_to_z(up_direction(viewmats))
+    rotation = rotation_to_z(level_up(viewmats))
     centers = -np.einsum("cij,ci->cj", viewmats[:, :3, :3], viewmats[:, :3, 3])
     focus = common_focus(centers, viewmats[:, 2, :3], points)
     scale = 1 / max(float(np.median(np.linalg.norm(centers - focus, axis=1))), 1e-12)
     return Similarity(scale, rotation, -scale * rotation @ focus)
 
 
-def up_direction(viewmats: Float[np.ndarray, "C 4 4"]) -> Float[np.ndarray, "3"]:
-    """Unit vector: perpendicular to the cameras' x axes, which people hold level, on the side of the image tops.
+def level_up(viewmats: Float[np.ndarray, "C 4 4"]) -> Float[np.ndarray, "3"]:
+    """Unit vector perpendicular to the cameras' x axes, which people hold level, on the side of the image tops.
 
-    Where all cameras look the same way the x axes are parallel; then it is the mean of the image tops.
+    It is the mean of the image tops when the x axes are parallel (all cameras look the same way) or contradict it
+    (cameras that lie on their side).
     """
-    tops = -viewmats[:, 1, :3].mean(axis=0)
-    values, vectors = np.linalg.eigh(viewmats[:, 0, :3].T @ viewmats[:, 0, :3])
-    up = vectors[:, 0] if values[1] > FLAT * values.sum() else tops
-    if abs(up @ tops) < 0.3 * np.linalg.norm(tops):  # cameras that lie on their side: the horizon is not their x axis
-        up = tops
-    norm = float(np.linalg.norm(up))
-    up = up / norm if norm > 1e-9 else np.array([0.0, 0.0, 1.0])
-    return up if up @ tops >= 0 else -up
+    right = viewmats[:, 0, :3]
+    values = np.linalg.eigvalsh(right.T @ right)
+    level = values[1] > PARALLEL_SHARE * values.sum()
+    return up_direction(torch.from_numpy(viewmats), damping=0.0, least_cosine=0.3 if level else 1.0).numpy()
 
 
 def common_focus(
     centers: Float[np.ndarray, "C 3"], forwards: Float[np.ndarray, "C 3"], points: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, "3"]:
     """The point closest to all optical axes; where it does not lie in front of the cameras, the points' median."""
-    away = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    normal = away.sum(axis=0)
     fallback = np.median(points, axis=0) if len(points) else centers.mean(axis=0)
-    if np.linalg.cond(normal) > 1e4:
+    axes = torch.from_numpy(forwards)
+    if float(torch.linalg.cond(across_axes(axes).sum(0))) > 1e4:
         return fallback
-    focus = np.linalg.solve(normal, np.einsum("cij,cj->i", away, centers))
+    focus = nearest_to_axes(torch.from_numpy(centers), axes, damping=0.0).numpy()
     depths = np.einsum("ci,ci->c", focus - centers, forwards)
     return focus if float((depths > 0).mean()) > 0.9 else fallback
 

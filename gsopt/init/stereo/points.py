@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt.data.scene import Scene
-from gsopt.geometry.projection import Focus, find_focus, inside, project
+from gsopt.geometry.focus import Focus, find_focus
+from gsopt.geometry.projection import inside, project
 from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.matching import Matcher
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
