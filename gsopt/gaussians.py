@@ -12,21 +12,21 @@ from torch import Tensor
 from gsopt import check
 from gsopt.errors import InputError
 
-# Below this its reciprocal nears the end of float32's range, and the direction is lost.
 SMALLEST_QUAT = 1e-30
+"""Largest component below which the reciprocal nears the end of float32's range, and the direction is lost."""
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians in world space, stored before activation (what the optimiser sees).
+    """N Gaussians in world space, stored before activation (as the optimizer sees them).
 
     A color seen from unit direction d is `max(0, 0.5 + sum_k sh_k Y_k(d))`, sRGB-coded.
     """
 
     means: Float[Tensor, "N 3"]
-    """Centres, scene units."""
+    """Centers, scene units."""
     quats: Float[Tensor, "N 4"]
     """Rotations, wxyz, any norm > 0."""
     log_scales: Float[Tensor, "N 3"]
@@ -34,7 +34,7 @@ class Gaussians:
     logit_opacities: Float[Tensor, "N"]
     """Opacity before the sigmoid."""
     sh0: Float[Tensor, "N 1 3"]
-    """Band 0 of the spherical harmonics (the base colour)."""
+    """Band 0 of the spherical harmonics (the base color)."""
     shN: Float[Tensor, "N K-1 3"]
     """Bands 1 and up, K = (sh_degree + 1)^2."""
 

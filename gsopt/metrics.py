@@ -1,4 +1,4 @@
-"""What a render is judged by: PSNR, SSIM and LPIPS, as the field reports them.
+"""Image metrics: PSNR, SSIM and LPIPS, as the field reports them.
 
 Images are `[B, H, W, 3]`, sRGB-coded, 0..1. Every metric returns one value per image; the mean over views comes last.
 """
@@ -35,8 +35,8 @@ VGG_NOTE = (
     f"LPIPS (VGG) is left out: its weights, {VGG_FILE}, were not found. Set {VGG_VARIABLE} to that file; "
     "gsopt/weights/LICENSES.md says how to make it from the packages torchvision and lpips."
 )
-WEIGHTS_LIMIT = 200 * 2**20
-"""No file of weights unpacks to more than this many bytes."""
+MAX_WEIGHT_BYTES = 200 * 2**20
+"""Largest unpacked size of a file of weights."""
 PSNR_CAP = 100.0
 """dB; replaces the infinite PSNR of two equal images, which JSON cannot hold."""
 
@@ -63,7 +63,7 @@ def ssim(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) ->
 
 @dataclass(frozen=True)
 class _Layer:
-    """One convolution of a feature network, with what stands before and after it."""
+    """One convolution of a feature network, with its pooling before and its comparison after."""
 
     out_channels: int
     in_channels: int
@@ -73,7 +73,7 @@ class _Layer:
     pool: tuple[int, int] | None = None
     """Kernel and stride of the maximum taken before the convolution."""
     tap: bool = False
-    """Its activations are compared."""
+    """True when its activations are compared."""
 
 
 # Krizhevsky 2014 ("one weird trick") and Simonyan & Zisserman 2015 (configuration D), convolutions only.
@@ -111,7 +111,7 @@ class Lpips:
     def __init__(self, net: Literal["alex", "vgg"], weights: Path | None = None) -> None:
         """Read the weights: Alex's ship with gsopt, VGG's come from `weights` or `find_vgg_weights()`.
 
-        Raises InputError when there are none or the file is not what it should be.
+        Raises InputError when there are none or the file is invalid.
         """
         check.one_of("net", net, tuple(_LAYERS))
         path = weights or (_shipped_alex() if net == "alex" else find_vgg_weights())
@@ -122,7 +122,7 @@ class Lpips:
         self._weights = _read_weights(path, _expected_shapes(self._layers))
 
     def fits(self, height: int, width: int) -> bool:
-        """Whether images of this size are large enough for the network."""
+        """True when images of this size are large enough for the network."""
         return min(height, width) >= _SMALLEST[self.net]
 
     @torch.no_grad()
@@ -164,7 +164,7 @@ class Lpips:
 def find_vgg_weights() -> Path | None:
     """`lpips_vgg16.npz` from the environment variable, torch's hub cache or `shared/data/weights` beside the checkout.
 
-    The first that is there; None when there is none. A variable that names no file is an error (InputError), not a
+    Returns the first that exists, else None. A variable that names no file is an error (InputError), not a
     reason to look elsewhere.
     """
     named = os.environ.get(VGG_VARIABLE)
@@ -197,8 +197,8 @@ def _read_weights(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, T
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > WEIGHTS_LIMIT:
-            raise InputError(f"{path} must unpack to at most {WEIGHTS_LIMIT} bytes, got {unpacked}. {remedy}")
+        if unpacked > MAX_WEIGHT_BYTES:
+            raise InputError(f"{path} must unpack to at most {MAX_WEIGHT_BYTES} bytes, got {unpacked}. {remedy}")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in shapes if name in file.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

@@ -180,7 +180,7 @@ def test_pickled_weights_are_never_unpickled(tmp_path: Path) -> None:
 
 
 def test_weights_that_unpack_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metrics, "WEIGHTS_LIMIT", 1000)
+    monkeypatch.setattr(metrics, "MAX_WEIGHT_BYTES", 1000)
     path = tmp_path / "w.npz"
     np.savez_compressed(path, **{"conv0.weight": np.zeros(10_000)})
     with pytest.raises(InputError, match="at most 1000 bytes"):

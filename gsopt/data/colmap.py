@@ -1,6 +1,6 @@
 """COLMAP folders: sparse/0 or sparse (.bin or .txt), images/; optionally images_2/4/8, masks/ and sparse/0/test.txt.
 
-Written from COLMAP's documented format ("Output Format"); poses are world to camera in OpenCV axes, pixel centres at
+Written from COLMAP's documented format ("Output Format"); poses are world to camera in OpenCV axes, pixel centers at
 +0.5. Counts in a file are checked against its size before anything is allocated.
 """
 
@@ -21,15 +21,15 @@ from gsopt.data.masks import find_mask
 from gsopt.data.posed_images import Dataset, PosedImage, check_enough, check_pose, summarize_names
 from gsopt.errors import InputError
 
-SUPPORTED = (
+SUPPORTED_MODELS = (
     "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, "
     "RADIAL_FISHEYE, THIN_PRISM_FISHEYE"
 )
 
 
 @dataclass(frozen=True)
-class Model:
-    """Where a reconstruction lies and how it is written."""
+class ColmapModel:
+    """Folder and file format of a reconstruction."""
 
     folder: Path
     suffix: str
@@ -39,11 +39,11 @@ class Model:
         return self.folder / (stem + self.suffix)
 
 
-def find_model(root: Path) -> Model | None:
+def find_model(root: Path) -> ColmapModel | None:
     """The reconstruction below `root`: sparse/0 before sparse, .bin before .txt."""
     for folder in (root / "sparse" / "0", root / "sparse"):
         for suffix in (".bin", ".txt"):
-            model = Model(folder, suffix)
+            model = ColmapModel(folder, suffix)
             if files.is_regular(model.file("cameras")) and files.is_regular(model.file("images")):
                 return model
     return None
@@ -109,7 +109,7 @@ def _frame(root: Path, record: ImageRecord, camera: CameraRecord, image: Path, w
 
 
 def _rotation(quat: tuple[float, float, float, float], where: str) -> Float[Tensor, "3 3"]:
-    """Rotation matrix of a wxyz quaternion, normalised first."""
+    """Rotation matrix of a wxyz quaternion, normalized first."""
     q = torch.tensor(quat, dtype=torch.float64)
     norm = float(q.norm())
     if not 1e-6 < norm < 1e6:
@@ -151,7 +151,9 @@ def _camera_model(camera: CameraRecord, where: str) -> tuple[Float[Tensor, "3 3"
     if model == "THIN_PRISM_FISHEYE":
         k1, k2, p1, p2, k3, k4, s1, s2 = rest
         return K, Lens(radial=(k1, k2, k3, k4), tangential=(p1, p2), prism=(s1, s2), fisheye=True)
-    raise InputError(f"The {where} uses camera model {model}; read are {SUPPORTED}. Undistort it with COLMAP first.")
+    raise InputError(
+        f"The {where} uses camera model {model}; read are {SUPPORTED_MODELS}. Undistort it with COLMAP first."
+    )
 
 
 def _held_out(path: Path, frames: list[PosedImage]) -> tuple[list[PosedImage] | None, list[PosedImage]]:

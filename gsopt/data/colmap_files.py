@@ -14,8 +14,7 @@ from jaxtyping import Float64, UInt8
 from gsopt.data import files
 from gsopt.errors import InputError
 
-# name, number of parameters; the row is COLMAP's model id.
-MODELS = (
+CAMERA_MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -29,6 +28,7 @@ MODELS = (
     ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )
+"""Name and number of parameters; the row is COLMAP's model id."""
 _REMEDY = "Export the model again."
 
 
@@ -65,7 +65,7 @@ def read_images(path: Path) -> list[ImageRecord]:
 
 
 def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Positions and colours. InputError on anything broken."""
+    """Positions and colors. InputError on anything broken."""
     rows = list(_points_binary(_Cursor(path)) if path.suffix == ".bin" else _points_text(path))
     xyz = np.array([row[:3] for row in rows], dtype=np.float64).reshape(-1, 3)
     rgb = np.array([row[3:] for row in rows], dtype=np.uint8).reshape(-1, 3)
@@ -124,9 +124,9 @@ _TRACK_BYTES = 8
 def _cameras_binary(cursor: _Cursor) -> Iterator[CameraRecord]:
     for _ in range(cursor.count(_CAMERA.size + 3 * 8)):
         camera_id, model, width, height = cursor.take(_CAMERA)
-        if not 0 <= model < len(MODELS):
+        if not 0 <= model < len(CAMERA_MODELS):
             raise InputError(f"Camera {camera_id} in {cursor.path} has unknown model id {model}. Export it as OPENCV.")
-        name, size = MODELS[model]
+        name, size = CAMERA_MODELS[model]
         yield CameraRecord(camera_id, name, width, height, cursor.take(struct.Struct(f"<{size}d")))
 
 
@@ -146,7 +146,7 @@ def _points_binary(cursor: _Cursor) -> Iterator[tuple[float, ...]]:
 
 
 def _cameras_text(path: Path) -> Iterator[CameraRecord]:
-    sizes = dict(MODELS)
+    sizes = dict(CAMERA_MODELS)
     for line, words in _records(path):
         try:
             model = words[1]
@@ -178,7 +178,7 @@ def _points_text(path: Path) -> Iterator[tuple[float, ...]]:
         try:
             rgb = [int(word) for word in words[4:7]]
             if len(rgb) != 3 or not 0 <= min(rgb) <= max(rgb) <= 255:
-                raise ValueError(f"colour {words[4:7]}")
+                raise ValueError(f"color {words[4:7]}")
             yield (*(float(word) for word in words[1:4]), *rgb)
         except (ValueError, IndexError) as error:
             raise _bad_line(path, line, error) from error

@@ -1,4 +1,4 @@
-"""Reading what a stranger gave us: regular files only, bounded sizes, and an InputError that names the file."""
+"""Checked reading of a dataset's files: regular files only, bounded sizes, and an InputError that names the file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from gsopt.errors import InputError
 
 MAX_LINE = 64 << 20
-"""A COLMAP keypoint line with a million points is 30 MB."""
+"""Characters; a COLMAP keypoint line with a million points is 30 MB."""
 MAX_JSON_BYTES = 256 << 20
 """Far above any dataset (10,000 frames are 10 MB), far below what would exhaust memory."""
 

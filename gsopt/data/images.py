@@ -24,7 +24,7 @@ from gsopt.data.resample import area_downscale, premultiply, unpremultiply
 from gsopt.data.undistort import Undistortion, undistort
 from gsopt.errors import InputError
 
-FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Only these decoders are reachable from a dataset."""
 MAX_PIXELS = 1 << 27
 """134 megapixels: above any camera, below a decompression bomb."""
@@ -33,21 +33,21 @@ _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 
 @dataclass(frozen=True)
 class ImageSource:
-    """One image file and how it becomes working pixels."""
+    """One image file and its way to working pixels."""
 
     path: Path
     mask: Path | None
     stored: tuple[int, int]
     """Width and height the file must have."""
     undistortion: Undistortion | None
-    """None when the lens is a pinhole."""
+    """Absent for a pinhole lens."""
     width: int
     height: int
     """Working size, never larger than `stored`."""
 
 
 class ImageStore:
-    """The images of a scene. `get` may be called from several threads; tensors are shared, so never write to one."""
+    """The images of a scene. Several threads may call `get`; tensors are shared, so never write to one."""
 
     def __init__(self, sources: Sequence[ImageSource], cache_mb: int) -> None:
         self.sources = tuple(sources)
@@ -108,7 +108,7 @@ class ImageStore:
 
 
 def size_mismatch(path: Path, got: tuple[int, int], declared: tuple[int, int]) -> InputError:
-    """The error for an image that is not as large as its dataset says."""
+    """The error for an image whose size differs from its dataset's."""
     return InputError(
         f"{path} is {got[0]}x{got[1]} pixels, but the dataset declares {declared[0]}x{declared[1]}. "
         "Restore the original image, or export the poses again for this size."
@@ -116,7 +116,7 @@ def size_mismatch(path: Path, got: tuple[int, int], declared: tuple[int, int]) -
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
-    """Width, height and whether there is alpha, without decoding."""
+    """Width, height, and True when there is alpha; without decoding."""
     with _open(path) as image:
         return image.width, image.height, _has_alpha(image)
 
@@ -147,7 +147,7 @@ def _open(path: Path) -> Image.Image:
     if not files.is_regular(path):
         raise InputError(f"The image {path} is not a readable file. Restore it, or remove its frame.")
     try:
-        image = Image.open(path, formats=FORMATS)
+        image = Image.open(path, formats=IMAGE_FORMATS)
     except Exception as error:  # decoders raise nearly anything on a hostile file
         raise _undecodable(path, error) from error
     if image.width * image.height > MAX_PIXELS:
@@ -166,8 +166,8 @@ def _has_alpha(image: Image.Image) -> bool:
 def _decode(image: Image.Image, mode: str, path: Path) -> UInt8[Tensor, "H W C"]:
     try:
         if image.mode == "F":
-            raise ValueError("its pixels are floating-point numbers, of which nobody knows the range; 8 bit are read")
-        if image.mode.startswith("I"):  # 16-bit grey: Pillow would clip it to 255 instead of scaling
+            raise ValueError("its pixels are floating-point numbers, whose range is unknown; 8 bit are read")
+        if image.mode.startswith("I"):  # 16-bit gray: Pillow would clip it to 255 instead of scaling
             wide = np.asarray(image, dtype=np.int64)
             few = mode == "L" and wide.max() <= 255  # a mask of 0 and 1, or of 0 and 255
             image = Image.fromarray(np.clip(wide >> (0 if few else 8), 0, 255).astype(np.uint8))
@@ -179,4 +179,6 @@ def _decode(image: Image.Image, mode: str, path: Path) -> UInt8[Tensor, "H W C"]
 
 def _undecodable(path: Path, error: Exception) -> InputError:
     reason = str(error) or type(error).__name__
-    return InputError(f"Cannot decode {path}: {reason}. Restore the file, or remove its frame ({', '.join(FORMATS)}).")
+    return InputError(
+        f"Cannot decode {path}: {reason}. Restore the file, or remove its frame ({', '.join(IMAGE_FORMATS)})."
+    )

@@ -16,7 +16,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Lens:
-    """Distortion of normalised image coordinates (x/z, y/z); all zero and no fisheye is a pinhole."""
+    """Distortion of normalized image coordinates (x/z, y/z); all zero and no fisheye is a pinhole."""
 
     radial: tuple[float, ...] = ()
     """k1, k2, ...: coefficients of r², r⁴, ..."""
@@ -34,7 +34,7 @@ class Lens:
         return not (self.fisheye or any((*self.radial, *self.divisor, *self.tangential, *self.prism)))
 
     def distort(self, xy: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B 2"]:
-        """Where a ray through ideal coordinates `xy` meets the real lens's image plane (focal length 1)."""
+        """Point of the real lens's image plane (focal length 1) that a ray through ideal coordinates `xy` meets."""
         if self.fisheye:
             xy = xy * _theta_over_tan(xy.square().sum(-1, keepdim=True).sqrt())
         x, y = xy.unbind(-1)

@@ -1,4 +1,4 @@
-"""Masks: black hides a pixel (alpha 0), white shows it; grey levels are partial alpha."""
+"""Masks: black hides a pixel (alpha 0), white shows it; gray levels are partial alpha."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ _MAX_HEADER = 1 << 16
 
 
 def read_points_ply(path: Path) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"]]:
-    """Positions (float64) and colours (grey where the file has none); rows that are not finite are left out."""
+    """Positions (float64) and colors (gray when the file has none); rows that are not finite are left out."""
     _check_counts(path)
     try:
         vertices = PlyData.read(str(path), mmap=False)["vertex"].data

@@ -1,4 +1,4 @@
-"""What a reader hands to `load_scene`: frames in float64, as the files say, before anything is chosen or moved."""
+"""Posed images as a dataset's files give them, in float64, before `load_scene` chooses or moves any."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PosedImage:
     height: int
     lens: Lens
     position: int
-    """What `--view-ids` calls it: its row in the file (NeRF-synthetic), else its row in name order."""
+    """Its number in `--view-ids`: its row in the file (NeRF-synthetic), else its row in name order."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Dataset:
     frames: list[PosedImage]
     """In the order that `--view-ids` counts."""
     held_out: list[PosedImage] | None
-    """Frames the dataset itself holds out; None when it says nothing."""
+    """Frames the dataset itself holds out; None for a dataset without a split."""
     xyz: Float[Tensor, "P 3"] | None = None
     rgb: UInt8[Tensor, "P 3"] | None = None
     warnings: list[str] = field(default_factory=list)

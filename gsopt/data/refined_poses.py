@@ -1,4 +1,4 @@
-"""The poses that a run with `--refine-poses` corrected, put back into its scene."""
+"""Poses that a run with `--refine-poses` corrected, put back into its scene."""
 
 from __future__ import annotations
 

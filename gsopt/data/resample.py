@@ -15,7 +15,7 @@ def downscaled_size(extent: int, factor: float) -> int:
 
 
 def premultiply(pixels: UInt8[Tensor, "H W C"]) -> Float[Tensor, "C H W"]:
-    """0..255 floats, colour times alpha where there is alpha."""
+    """0..255 floats, color times alpha where there is alpha."""
     planes = pixels.permute(2, 0, 1).float()
     if planes.shape[0] == 4:
         planes[:3] *= planes[3:] / 255
@@ -23,11 +23,11 @@ def premultiply(pixels: UInt8[Tensor, "H W C"]) -> Float[Tensor, "C H W"]:
 
 
 def unpremultiply(planes: Float[Tensor, "C H W"]) -> UInt8[Tensor, "H W C"]:
-    """Inverse of `premultiply`, rounded; colour is 0 where alpha is 0."""
+    """Inverse of `premultiply`, rounded; color is 0 where alpha is 0."""
     if planes.shape[0] == 4:
         alpha = planes[3:]
-        colour = torch.where(alpha > 0, planes[:3] * 255 / alpha.clamp(min=1e-6), torch.zeros_like(planes[:3]))
-        planes = torch.cat([colour, alpha])
+        color = torch.where(alpha > 0, planes[:3] * 255 / alpha.clamp(min=1e-6), torch.zeros_like(planes[:3]))
+        planes = torch.cat([color, alpha])
     return (planes + 0.5).clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous()
 
 
@@ -48,7 +48,7 @@ def _area_along(planes: Tensor, axis: int, size: int) -> Tensor:
     first = starts.floor().long()
     total = torch.zeros(*planes.shape[:axis], size, *planes.shape[axis + 1 :])
     for offset in range(math.ceil(step) + 1):
-        # How much of source pixel `first + offset` lies inside the target pixel.
+        # The share of source pixel `first + offset` that lies inside the target pixel.
         index = first + offset
         overlap = (torch.minimum(ends, index + 1.0) - torch.maximum(starts, index.double())).clamp(min=0)
         weight = (overlap / step).float().view(*[-1 if a == axis else 1 for a in range(3)])

@@ -1,4 +1,4 @@
-"""A posed scene: views to learn from, views to judge by, and the points the poses came with."""
+"""A posed scene: input views, held-out views, and the points the poses came with."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FAR_FROM_ORIGIN = 1e3
 
 @dataclass(frozen=True)
 class View:
-    """One posed image. Pixels are read when asked for and cached by the store."""
+    """One posed image. Its pixels are read on demand and cached by the store."""
 
     name: str
     """Path of the image relative to the scene, with forward slashes."""
@@ -49,7 +49,7 @@ class View:
 
 @dataclass(frozen=True)
 class Points:
-    """Sparse coloured points, usually from structure from motion."""
+    """Sparse colored points, usually from structure from motion."""
 
     xyz: Float[Tensor, "P 3"]
     rgb: UInt8[Tensor, "P 3"]
@@ -70,7 +70,7 @@ class Scene:
     has_alpha: bool
     """True when every input view has alpha or a mask."""
     warnings: tuple[str, ...]
-    """What the loader noticed (images absent, images skipped): shown to the user and kept with the run."""
+    """Irregularities in the dataset (images absent, images skipped): printed and kept with the run."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from every source position; not zero only where coordinates were too large for float32."""
     mirrored: tuple[View, ...] = ()
@@ -78,14 +78,14 @@ class Scene:
 
     @property
     def drawn(self) -> tuple[View, ...]:
-        """What a step may draw: the input views, then their mirror images."""
+        """The views a training step draws from: the input views, then their mirror images."""
         return self.train + self.mirrored
 
     @property
     def extent(self) -> float:
         """1.1 times the farthest input camera's distance from their mean (Kerbl et al. 2023), scene units.
 
-        Where the cameras stand in one place: their mean distance to the points, else 1.
+        For cameras in one place it is their mean distance to the points, else 1.
         """
         centers = torch.cat([view.camera.centers for view in self.train])
         radius = 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
@@ -99,7 +99,7 @@ class Scene:
 def load_scene(config: DataConfig | str | Path) -> Scene:
     """Read a NeRF-synthetic, nerfstudio/instant-ngp or COLMAP folder; a path stands for `DataConfig(path=...)`.
 
-    Images are opened for their size only; pixels are read when asked for. Raises InputError for anything wrong with
+    Images are opened for their size only; pixels are read on demand. Raises InputError for anything wrong with
     the folder and UsageError for `--views` and `--view-ids` that do not fit it.
     """
     if not isinstance(config, DataConfig):
@@ -127,7 +127,7 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
 
 
 def is_posed(root: Path) -> bool:
-    """Whether a folder holds a dataset with poses, as far as its files' names tell."""
+    """True when a folder holds a dataset with poses, by the names of its files."""
     return find_model(root) is not None or any(
         files.is_regular(root / name) for name in ("transforms_train.json", "transforms.json")
     )
@@ -151,7 +151,7 @@ def read_dataset(root: Path) -> Dataset:
 
 
 def _origin(frames: list[PosedImage], warnings: list[str]) -> Float[Tensor, "3"]:
-    """Zero, or the rounded mean camera centre when the scene lies too far out for float32."""
+    """Zero, or the rounded mean camera center when the scene lies too far out for float32."""
     centers = torch.stack([-frame.viewmat[:3, :3].T @ frame.viewmat[:3, 3] for frame in frames])
     mean = centers.mean(0)
     extent = 1.1 * float((centers - mean).norm(dim=1).max())
@@ -169,7 +169,7 @@ def _origin(frames: list[PosedImage], warnings: list[str]) -> Float[Tensor, "3"]
 def _views(
     root: Path, frames: list[PosedImage], origin: Tensor, config: DataConfig
 ) -> tuple[tuple[View, ...], list[bool]]:
-    """Views that share one store, and which of them have alpha."""
+    """Views that share one store, and per view True when it has alpha."""
     pinholes: dict[tuple[object, ...], Undistortion] = {}
     prepared = [_prepare(root, frame, config.downscale, pinholes) for frame in frames]
     store = ImageStore([image for image, _, _ in prepared], config.cache_mb)
@@ -183,7 +183,7 @@ def _views(
 def _prepare(
     root: Path, frame: PosedImage, factor: int, pinholes: dict[tuple[object, ...], Undistortion]
 ) -> tuple[ImageSource, Tensor, bool]:
-    """How the frame's file becomes working pixels, the pinhole K at working size, and whether there is alpha."""
+    """The source of the frame's pixels, the pinhole K at working size, and True when there is alpha."""
     path, stored = _stored_image(root, frame, factor)
     width, height = (downscaled_size(extent, factor) for extent in (frame.width, frame.height))
     K, undistortion = _resized(frame.K, (frame.width, frame.height), stored), None

@@ -1,4 +1,4 @@
-"""Which frames a run learns from and which it is judged by."""
+"""Splits a dataset into input and held-out views."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from gsopt.data.posed_images import Dataset, PosedImage
 from gsopt.errors import UsageError
 
 HOLD_OUT_EVERY = 8
+"""As Mip-NeRF 360 and 3DGS do."""
 
 
 def split(dataset: Dataset, config: DataConfig) -> tuple[list[PosedImage], list[PosedImage]]:

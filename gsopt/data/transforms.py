@@ -22,7 +22,7 @@ from gsopt.data.posed_images import Dataset, PosedImage, check_enough, read_pose
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import intrinsics, viewmats_from_opengl
 
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG")
+IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 
@@ -48,7 +48,7 @@ def read_transforms(root: Path) -> Dataset:
 
 
 def read_frames(document: dict[str, Any], path: Path, warnings: list[str]) -> tuple[list[PosedImage], list[str]]:
-    """The frames whose image exists, in file order, and the names of the others, which `warnings` tells of."""
+    """The frames whose image exists, in file order, and the names of the others, reported in `warnings`."""
     entries = document.get("frames")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} has no list `frames` with at least one entry. Export the dataset again.")
@@ -74,7 +74,7 @@ def _find_image(root: Path, file_path: str) -> Path | None:
     path = files.child(root, file_path)
     if files.is_regular(path):
         return path
-    for extension in EXTENSIONS:
+    for extension in IMAGE_EXTENSIONS:
         candidate = path.parent / (path.name + extension)
         if files.is_regular(candidate):
             return candidate
@@ -127,7 +127,7 @@ def _size(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:
 
 
 def _intrinsics(values: dict[str, Any], width: int, height: int, where: str) -> Float[Tensor, "3 3"]:
-    """From fl_x, fl_y, cx, cy, else from camera_angle_x (radians across the width), square pixels, centred."""
+    """From fl_x, fl_y, cx, cy, else from camera_angle_x (radians across the width), square pixels, centered."""
 
     def read(key: str, default: float) -> float:
         return files.number(values[key], f"`{key}` of {where}") if key in values else default

@@ -1,4 +1,4 @@
-"""Replace a real lens by a pinhole: choose the pinhole, then sample the stored image where each of its rays fell.
+"""Replaces a real lens by a pinhole: chooses the pinhole, then samples the stored image where each of its rays fell.
 
 The forward lens model is closed form, so the target-to-source map is exact: no inverse distortion is ever iterated.
 The pinhole keeps the image size, the principal point and the ratio fx/fy; only the focal length is scaled, by the
@@ -19,7 +19,8 @@ from gsopt.errors import InputError
 
 ZOOM_MIN, ZOOM_MAX = 0.8, 8.0
 _BISECTIONS = 40
-_GRID = 65
+_TEST_POINTS = 65
+"""Pixels along each side that `_covers` tests."""
 _BAND_ROWS = 256
 
 
@@ -29,14 +30,14 @@ class Undistortion:
 
     lens: Lens
     K: Float[Tensor, "3 3"]
-    """Of the stored image, float64."""
+    """Intrinsics of the stored image, float64."""
     pinhole: Float[Tensor, "3 3"]
-    """Of the undistorted image of the same size, float64."""
+    """Intrinsics of the undistorted image of the same size, float64."""
     width: int
     height: int
 
     def source_from_target(self, pixels: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B 2"]:
-        """Stored pixel coordinates for undistorted ones (both with centres at +0.5), float64."""
+        """Stored pixel coordinates for undistorted ones (both with centers at +0.5), float64."""
         return _source_from_target(self.lens, self.K, self.pinhole, pixels)
 
     def sample_grid(self) -> Float[Tensor, "H W 2"]:
@@ -80,9 +81,9 @@ def _zoomed(K: Tensor, factor: float) -> Tensor:
 
 
 def _covers(lens: Lens, K: Tensor, pinhole: Tensor, width: int, height: int) -> bool:
-    """True when target pixels land between the first and last pixel centres of the source, without folding over."""
-    x = torch.linspace(0.5, width - 0.5, _GRID, dtype=torch.float64)
-    y = torch.linspace(0.5, height - 0.5, _GRID, dtype=torch.float64)
+    """True when target pixels land between the first and last pixel centers of the source, without folding over."""
+    x = torch.linspace(0.5, width - 0.5, _TEST_POINTS, dtype=torch.float64)
+    y = torch.linspace(0.5, height - 0.5, _TEST_POINTS, dtype=torch.float64)
     target = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
     source = _source_from_target(lens, K, pinhole, target)
     last = torch.tensor([width, height], dtype=torch.float64) - 0.5

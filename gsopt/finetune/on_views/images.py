@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsopt.config.train import DataConfig
 from gsopt.data.files import is_regular
-from gsopt.data.images import FORMATS, read_header, read_pixels
+from gsopt.data.images import IMAGE_FORMATS, read_header, read_pixels
 from gsopt.data.scene import View, is_posed, load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.finetune.captions import said_of
@@ -122,7 +122,7 @@ def read_upright(path: Path) -> UInt8[Tensor, "H W C"]:
     """A plain image, turned as its EXIF tag says: unlike views it has no pose that refers to the stored rows."""
     pixels = read_pixels(path)
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
             turn = UPRIGHT.get(image.getexif().get(ORIENTATION, 1))
     except Exception:  # a broken tag tells nothing
         turn = None
