@@ -1,1 +1,1 @@
-"""What `gsopt bench` measures: kernels (speed, growth, accuracy over time), written as JSON and drawn from it."""
+"""Measurements of `gsopt bench`: kernels, whole scenes and suites, written as JSON and drawn from it."""

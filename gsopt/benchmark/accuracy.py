@@ -30,13 +30,13 @@ from gsopt.raster.reference import hard_threshold, raw_alphas, splat, transmitta
 
 IMAGE_SIDE, GAUSSIAN_COUNT = 64, 2_000
 TIE_MARGIN = 1e-4
-"""Pixels where the threshold at 1/255, the clamp at 0.99 or the stop at T = 1e-4 lies within this (relative) are left
-out: float32 may decide differently there, which says nothing about its arithmetic."""
+"""Relative distance to the threshold at 1/255, the clamp at 0.99 or the stop at T = 1e-4 below which a pixel is left
+out: float32 may decide differently there, whatever the quality of its arithmetic."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """An image, and the gradients of a fixed weighted sum of its values."""
+    """A render, and the gradients of a fixed weighted sum of its values."""
 
     colors: Tensor
     gradients: Gradients
@@ -69,7 +69,7 @@ def accuracy(count: int = GAUSSIAN_COUNT, side: int = IMAGE_SIDE, repetitions: i
 
 
 def decided_pixels(gaussians: Gaussians, camera: Cameras) -> Bool[Tensor, "H W"]:
-    """Where no decision of the image model stands within `TIE_MARGIN` of tipping."""
+    """True where every decision of the image model is at least `TIE_MARGIN` from changing."""
     nothing = gaussians.means.new_zeros(len(gaussians), 2)
     splats = splat(gaussians, camera.to(gaussians.means.dtype), RasterSettings(), nothing)
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
@@ -81,8 +81,8 @@ def decided_pixels(gaussians: Gaussians, camera: Cameras) -> Bool[Tensor, "H W"]
         (raw, ALPHA_MAX, TIE_MARGIN),
         (before, TRANSMITTANCE_MIN, 10 * TIE_MARGIN),
     ]
-    tips = [((values / line - 1).abs() < margin).any(dim=1) for values, line, margin in lines]
-    return ~torch.stack(tips).any(dim=0).view(camera.height, camera.width)
+    ties = [((values / line - 1).abs() < margin).any(dim=1) for values, line, margin in lines]
+    return ~torch.stack(ties).any(dim=0).view(camera.height, camera.width)
 
 
 def compiled() -> Iterator[tuple[str, Backend]]:
@@ -97,7 +97,7 @@ def compiled() -> Iterator[tuple[str, Backend]]:
 
 @contextmanager
 def instruction_set(isa: str) -> Iterator[None]:
-    """Backends made in this block run on `isa`."""
+    """Makes backends created in this block run on `isa`."""
     before = os.environ.get(ISA_VARIABLE)
     os.environ[ISA_VARIABLE] = isa
     try:

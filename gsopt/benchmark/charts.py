@@ -18,7 +18,7 @@ STYLE = (
 
 @dataclass(frozen=True)
 class Series:
-    """Points with a name; `line` joins them, else they are dots only."""
+    """Named points, joined by a line when `line` is set."""
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -27,13 +27,13 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis: what it shows with its unit, and whether in powers of ten."""
+    """One axis: its label with the unit, and whether its scale is logarithmic."""
 
     label: str
     log: bool = False
 
     def span(self, values: Sequence[float]) -> tuple[float, float]:
-        """Rounded outwards to whole powers of ten, or with some room."""
+        """Both ends of the axis: rounded outwards to powers of ten, or with a margin of 6 %."""
         low, high = min(values), max(values)
         if self.log:
             return 10.0 ** math.floor(math.log10(low) + 1e-9), 10.0 ** math.ceil(
@@ -43,7 +43,7 @@ class Axis:
         return low - room, high + room
 
     def share(self, value: float, span: tuple[float, float]) -> float:
-        """Where a value stands between both ends, 0 to 1."""
+        """Position of a value between both ends, 0 to 1."""
         low, high = span
         if self.log:
             return math.log(value / low) / math.log(high / low)
@@ -62,7 +62,7 @@ class Axis:
 
 
 def chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
-    """A whole SVG document. Points that a logarithmic axis cannot show are left out."""
+    """A whole SVG document. Points without a place on a logarithmic axis are left out."""
     kept = [Series(s.name, [p for p in s.points if drawable(p, x, y)], s.line) for s in series]
     kept = [s for s in kept if s.points]
     points = [point for s in kept for point in s.points]

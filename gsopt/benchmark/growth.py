@@ -1,4 +1,4 @@
-"""How cost grows with the number of Gaussians and with the number of pixels."""
+"""Growth of the cost with the number of Gaussians and with the number of pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIXED_SIDE, FIXED_COUNT = 800, 100_000
 
 
 def by_count(counts: Sequence[int] = COUNTS, report: Callable[[str], None] = print) -> dict[str, Any]:
-    """Iterations at 800 x 800 with more and more Gaussians, ever smaller: the surface stays the same."""
+    """Iterations at 800 x 800 with more and smaller Gaussians on the same surface."""
     cases = [Case(f"{FIXED_SIDE}x{FIXED_SIDE}/{count}", FIXED_SIDE, FIXED_SIDE, count) for count in counts]
     fixed = f"{FIXED_SIDE}x{FIXED_SIDE} pixels, 1 thread"
     return series("Gaussians", fixed, [(case.count, case) for case in cases], report)
@@ -30,8 +30,8 @@ def by_pixels(sides: Sequence[int] = SIDES, report: Callable[[str], None] = prin
 
 
 def series(what: str, fixed: str, cases: Sequence[tuple[int, Case]], report: Callable[[str], None]) -> dict[str, Any]:
-    """One record (`schema.GROWTH`). The exponent is that of the upper half, where fixed costs no longer show."""
-    measure(cases[0][1])  # the first one pays for memory that the process keeps
+    """One record (`schema.GROWTH`). The exponent is fitted to the upper half, where fixed costs are negligible."""
+    measure(cases[0][1])  # the first measurement includes allocations that the process keeps
     points = []
     for size, case in cases:
         points.append({"size": size, **measure(case)})

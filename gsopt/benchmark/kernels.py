@@ -1,4 +1,4 @@
-"""How fast the compiled kernels are: full training iterations over scenes of surfaces, stage by stage.
+"""Speed of the compiled kernels: full training iterations over scenes of surfaces, stage by stage.
 
 A full iteration is projection, SH of degree 3, sort and binning, blending, L1 + D-SSIM, its gradient through all of
 that, and one Adam step of every parameter.
@@ -28,9 +28,9 @@ CASES = ("200x200/20k", "400x400/50k", "800x800/100k", "800x800/300k")
 CASE_PATTERN = re.compile(r"(\d+)x(\d+)/(\d+)(k|M|)")
 UNITS = {"": 1, "k": 1_000, "M": 1_000_000}
 LAMBDA_DSSIM = 0.2
-# What a pixel and a splat cost at least beside one exponential, in fused multiply-adds (or other operations of the
-# same pipes). Forward: 5 for the exponent, 1 for the weight, 4 for transmittance and colors. Backward: 5 and 10 to
-# go back through them, and 10 for the nine sums over the pixels of a block, most of which are shuffles and additions.
+# Least cost of one pair of pixel and splat beside one exponential, in fused multiply-adds (or other operations of the
+# same pipes). Forward: 5 for the exponent, 1 for the weight, 4 for transmittance and colors. Backward: 5 and 10 for
+# their gradients, and 10 for the nine sums over the pixels of a block, most of which are shuffles and additions.
 FORWARD_FMAS, BACKWARD_FMAS = 10, 25
 
 
@@ -45,7 +45,7 @@ class Case:
 
     @staticmethod
     def parse(name: str) -> Case:
-        """From "800x800/100k"; UsageError for anything else."""
+        """The case named "800x800/100k"; UsageError for anything else."""
         match = CASE_PATTERN.fullmatch(name)
         if match is None:
             raise UsageError(f"`--case` must be WIDTHxHEIGHT/COUNT, got {name!r}. Try one of {', '.join(CASES)}.")
@@ -75,11 +75,11 @@ class Iteration:
         self.model = Model.start(gaussians)
         self.settings = RasterSettings()
         self.config = OptimizerConfig()
-        # Rates so small that the scene is the same for the first and for the last repetition.
+        # Rates so small that the scene does not change between the first and the last repetition.
         self.rates = {name: 1e-7 * rate for name, rate in learning_rates(self.config, 1e-4).items()}
         self.target = blurred_noise(self.camera)
         self.gradients: Gradients | None = None
-        """Of the last iteration, written over by the next one, as the trainer does."""
+        """Gradients of the last iteration; the next one reuses their memory, as the trainer does."""
 
     def run(self) -> None:
         """One full iteration."""
@@ -89,12 +89,12 @@ class Iteration:
         adam_step(self.model, self.gradients, self.rates, self.config, self.backend, self.camera, self.settings)
 
     def render(self) -> None:
-        """The picture alone."""
+        """One forward pass."""
         frame = self.backend.forward(self.model.gaussians, self.camera, self.settings)
         self.backend.release(frame)
 
     def work(self) -> tuple[int, int, int]:
-        """(tile intersections, splat-block entries looked at, splat-pixel pairs that contributed) of one frame."""
+        """(tile intersections, splat-block entries evaluated, contributing splat-pixel pairs) of one frame."""
         workspace = self.backend._workspace
         before = workspace.work
         workspace.count_work = True
@@ -112,7 +112,7 @@ class Iteration:
 
 
 def blurred_noise(camera: Cameras) -> Float[Tensor, "H W 3"]:
-    """Something to compare the image with."""
+    """The training image of the iteration."""
     noise = torch.rand(1, 3, camera.height, camera.width, generator=torch.Generator().manual_seed(1))
     return torch.nn.functional.avg_pool2d(noise, 5, 1, 2)[0].permute(1, 2, 0).contiguous()
 
@@ -160,17 +160,17 @@ def measure(case: Case, threads: int, repetitions: int, rates: dict[str, dict[st
 
 
 LANES = {"avx512": 16, "avx2x2": 16, "avx2": 8, "portable": 8, "neon": 8}
-"""Pixels of a block, which is the width of a vector of the kernels."""
+"""Pixels per block, the vector width of the kernels."""
 
 
 def bound(lanes: int, fmas: int, rates: dict[str, float]) -> float:
-    """Seconds that one core needs at least for so many lanes of one exponential and `fmas` multiply-adds."""
+    """Least seconds of one core for `lanes` lanes, each of one exponential and `fmas` multiply-adds."""
     return lanes * (fmas / rates["fma_per_second"] + 1 / rates["exp_per_second"])
 
 
 def core_seconds(stage: dict[str, Any], threads: int) -> float:
-    """Seconds that a stage took on all its cores together. With several threads that is wall time, times the threads:
-    the clock of a process learns what another thread spent at the scheduler's ticks only, long after a stage."""
+    """Seconds of a stage over all its cores. With several threads this is wall time times threads, because the clock of
+    a process counts the time of its other threads only at the scheduler's ticks, long after a stage."""
     milliseconds = stage["cpu_ms"]["median"] if threads == 1 else threads * stage["wall_ms"]["median"]
     return milliseconds / 1000
 

@@ -1,4 +1,4 @@
-"""What figures depend on besides the code: the machine, its load, and what one core of it can do at best."""
+"""The machine that a figure was measured on: its processor, its load, and the peak rates of one core."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsopt._version import __version__
 
 
 def machine() -> dict[str, Any]:
-    """Metadata that every result carries (`schema.MACHINE`)."""
+    """Metadata of every result (`schema.MACHINE`)."""
     return {
         "cpu": cpu_name(),
         "cores": os.cpu_count() or 1,
@@ -36,7 +36,7 @@ def cpu_name() -> str:
 
 
 def commit() -> str | None:
-    """The commit that the sources stand at, with + when files differ from it; None for an installed package."""
+    """Commit of the sources, with + when files differ from it; None for an installed package."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -66,7 +66,7 @@ def calibration() -> dict[str, dict[str, float]]:
 
 
 def resident_mb() -> float | None:
-    """Memory that this process holds now, MB (10^6 bytes); None where the system does not say."""
+    """Resident memory of this process, MB (10^6 bytes); None where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except (OSError, ValueError, IndexError):

@@ -1,4 +1,4 @@
-"""Rewrites the parts of a document that come from measurements, and nothing else in it."""
+"""Markdown tables, and the blocks of a document that come from measurements."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsopt.events import write_atomic
 
 
 def replace_block(path: Path, name: str, body: str) -> None:
-    """Put `body` between `<!-- begin NAME -->` and `<!-- end NAME -->` of a text file."""
+    """Writes `body` between `<!-- begin NAME -->` and `<!-- end NAME -->` of a text file."""
     begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
     try:
         text = path.read_text(encoding="utf-8")

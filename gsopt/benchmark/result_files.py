@@ -1,4 +1,4 @@
-"""Result files: read, merged with what was measured now, checked, written whole."""
+"""Result files of kernels and scenes: read, merged with new measurements, checked, written whole."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read(path: Path, shape: schema.Schema = schema.KERNELS) -> dict[str, Any]:
 
 
 def parsed(path: Path) -> dict[str, Any]:
-    """A JSON object, whatever it holds."""
+    """A JSON object with any content."""
     try:
         document = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -33,8 +33,8 @@ def parsed(path: Path) -> dict[str, Any]:
 
 
 def update(path: Path, measured: dict[str, Any]) -> None:
-    """Write `measured` (command, machine, calibration and any of cases, growth, accuracy); records of other cases and
-    parts that were not measured now are kept. Raises InputError before anything is written when the shape is wrong."""
+    """Writes `measured` (command, machine, calibration and any of cases, growth, accuracy) and keeps the records of
+    other cases and parts. Raises InputError before anything is written when the shape is wrong."""
     old = read(path) if path.exists() else EMPTY
     document = {"version": VERSION, **{part: old[part] for part in EMPTY}, **measured}
     if "cases" in measured:
@@ -44,18 +44,18 @@ def update(path: Path, measured: dict[str, Any]) -> None:
 
 
 def merged(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One record per case, number of threads and instruction set: the newer one, in order of the work in it."""
+    """One record per case, number of threads and instruction set, the newer one, ordered by size."""
     records = {(record["case"], record["threads"], record["isa"]): record for record in [*old, *new]}
     return sorted(records.values(), key=lambda r: (r["width"] * r["height"], r["gaussians"], r["threads"], r["isa"]))
 
 
 def run_key(record: dict[str, Any]) -> tuple[Any, ...]:
-    """Records with the same key are of the same run of a scene."""
+    """Key that is equal for records of the same run of a scene."""
     return record["scene"], record["kind"], record["preset"], record["iterations"], record["max_gaussians"]
 
 
 def update_runs(path: Path, command: str, machine: dict[str, Any], record: dict[str, Any]) -> None:
-    """Add one run of a scene to a file; an older record of the same run goes."""
+    """Adds one run of a scene to a file, in place of an older record of the same run."""
     old = read(path, schema.SCENES)["runs"] if path.exists() else []
     runs = [run for run in old if run_key(run) != run_key(record)] + [record]
     document = {"version": VERSION, "command": command, "machine": machine, "runs": runs}

@@ -24,7 +24,7 @@ def write_page(result: dict[str, Any], page: Path) -> None:
 
 
 def scenes(result: dict[str, Any]) -> list[str]:
-    """In the order they were first measured."""
+    """Names of the scenes, in the order of their first measurement."""
     return list(dict.fromkeys(run["scene"] for run in result["runs"]))
 
 
@@ -36,7 +36,7 @@ def runs_of(result: dict[str, Any], scene: str, kind: str) -> list[dict[str, Any
 
 
 def charts(result: dict[str, Any], scene: str) -> dict[str, str]:
-    """By file name."""
+    """SVG by file name without suffix."""
     drawn, x = {}, Axis(SECONDS, log=True)
     for key, (word, label) in METRICS.items():
         curves = [
@@ -49,7 +49,7 @@ def charts(result: dict[str, Any], scene: str) -> dict[str, str]:
 
 
 def pareto_chart(result: dict[str, Any], scene: str) -> str:
-    """PSNR over time at the end of every run of the grid, one series per budget, and what no other run beats."""
+    """PSNR over time at the end of every run of the grid, one series per budget, and the Pareto front."""
     series: dict[int, list[tuple[float, float]]] = {}
     for run in runs_of(result, scene, "grid"):
         last = run["points"][-1]

@@ -1,4 +1,4 @@
-"""Quality over time of whole runs: every preset as it goes on, and a grid of budgets and lengths."""
+"""Quality over time of whole runs: a curve for every preset, and a grid of budgets and lengths."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from gsopt.results.evaluation import evaluate_views
 from gsopt.training.loop import TrainResult, train
 
 EVALUATIONS = 8
-"""How often a preset is judged on its way."""
+"""Evaluations during the run of a preset."""
 MAX_EVALUATED_VIEWS = 16
-"""Held-out views that are judged, evenly spread."""
+"""Held-out views that are evaluated, evenly spread."""
 
 Event = Mapping[str, Any]
 
@@ -39,7 +39,7 @@ class Task:
     data: DataConfig
     preset: str = "default"
     iterations: int | None = None
-    """The preset's when not given."""
+    """Number of steps; the preset's when None."""
     max_gaussians: int | None = None
 
     @property
@@ -48,7 +48,7 @@ class Task:
         return "curve" if self.iterations is None and self.max_gaussians is None else "grid"
 
     def config(self) -> TrainConfig:
-        """One thread, no guidance; the grid looks only at the end."""
+        """One thread, no guidance; runs of the grid are evaluated only at their end."""
         config = with_preset(
             TrainConfig(data=self.data, guidance=GuidanceConfig(lambda_sds=0.0), threads=1), self.preset
         )
@@ -59,13 +59,13 @@ class Task:
         return replace(config, density=density, preview_every=every, checkpoint_every=0)
 
     def key(self) -> tuple[Any, ...]:
-        """What makes two records records of the same run."""
+        """Key that is equal for records of the same run."""
         config = self.config()
         return self.scene, self.kind, self.preset, config.iterations, self.max_gaussians
 
 
 def measure(task: Task) -> dict[str, Any]:
-    """Train and judge (`schema.RUN`); CPU time of the steps alone, without reading and judging."""
+    """Trains and evaluates (`schema.RUN`); CPU time counts the steps alone, without reading and evaluation."""
     events: list[Event] = []
     with tempfile.TemporaryDirectory() as folder:
         result = train(task.config(), Path(folder) / "run", on_progress=events.append)
@@ -87,12 +87,12 @@ def measure(task: Task) -> dict[str, Any]:
 
 
 class Evaluator:
-    """Draws the held-out views of one run's scene and compares."""
+    """Renders the held-out views of one run's scene and compares them with the truth."""
 
     def __init__(self, task: Task, result: TrainResult) -> None:
         views = result.scene.test
         if not views:
-            raise UsageError(f"{task.data.path} holds out no views, so nothing can be judged. Add --eval.")
+            raise UsageError(f"{task.data.path} holds out no views, so nothing can be evaluated. Add --eval.")
         count = min(MAX_EVALUATED_VIEWS, len(views))
         self._views = [views[i * len(views) // count] for i in range(count)]
         self._backend = make_backend("auto", 1)
@@ -109,17 +109,17 @@ class Evaluator:
 
 
 def time_at(step: int, events: Sequence[Event]) -> tuple[float, float]:
-    """CPU and wall seconds when a step was done, between what was told before and after it."""
-    told = [(0, 0.0, 0.0), *((e["step"], e["cpu_seconds"], e["seconds"]) for e in events if e["kind"] == "progress")]
-    for before, after in itertools.pairwise(told):
+    """CPU and wall seconds at the end of a step, interpolated between the progress events around it."""
+    known = [(0, 0.0, 0.0), *((e["step"], e["cpu_seconds"], e["seconds"]) for e in events if e["kind"] == "progress")]
+    for before, after in itertools.pairwise(known):
         if before[0] <= step <= after[0] > before[0]:
             share = (step - before[0]) / (after[0] - before[0])
             return before[1] + share * (after[1] - before[1]), before[2] + share * (after[2] - before[2])
-    return told[-1][1:]
+    return known[-1][1:]
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The Pareto front of (cost, quality): those points that none beats in both, by rising cost."""
+    """The Pareto front of (cost, quality): the points that no other point beats in both, by rising cost."""
     best, kept = float("-inf"), []
     for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):
         if quality > best:

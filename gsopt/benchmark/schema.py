@@ -13,7 +13,7 @@ from gsopt.errors import InputError
 
 Schema = Any
 SPREAD = {"median": float, "iqr": float}
-"""Of repeated measurements; iqr is the distance between the quartiles."""
+"""Milliseconds of repeated measurements; iqr is the distance between the quartiles."""
 MACHINE = {
     "cpu": str,
     "cores": int,
@@ -25,7 +25,7 @@ MACHINE = {
     "load": (float, None),
 }
 CALIBRATION = {str: {"fma_per_second": float, "exp_per_second": float}}
-"""By instruction set: lanes per second of one core."""
+"""Lanes per second of one core, by instruction set."""
 STAGES = {str: {"cpu_ms": SPREAD, "wall_ms": SPREAD}}
 CASE = {
     "case": str,
@@ -67,7 +67,7 @@ QUALITY = {
     "ssim": float,
     "lpips_alex": (float, None),
 }
-"""Held-out quality of one moment of a run, and the time that its steps took until then."""
+"""Held-out quality at one step of a run, and the time that its steps took until then."""
 RUN = {
     "scene": str,
     "kind": str,
@@ -121,4 +121,6 @@ def _name(kind: Any) -> str:
 
 
 def _mismatch(where: str, want: str, got: Any) -> InputError:
-    return InputError(f"`{where}` must be {want}, got {str(got)[:80]!r}. Write it anew with `gsopt bench`.")
+    return InputError(
+        f"`{where}` must be {want}, got {str(got)[:80]!r}. Correct the file, or write it again with `gsopt bench`."
+    )

@@ -14,7 +14,7 @@ class Reading:
     """One repetition, seconds."""
 
     cpu: float
-    """Of all threads of this process; other work on the machine does not add to it, but may slow caches."""
+    """CPU time of all threads of this process; other work on the machine does not add to it, but may slow caches."""
     wall: float
 
 
@@ -26,7 +26,7 @@ def read(action: Callable[[], object]) -> Reading:
 
 
 def repeat(action: Callable[[], object], repetitions: int, warm_up: int = 2) -> list[Reading]:
-    """Time `repetitions` calls after a few that do not count."""
+    """Times `repetitions` calls after `warm_up` calls that are not counted."""
     for _ in range(warm_up):
         action()
     return [read(action) for _ in range(repetitions)]

@@ -1,7 +1,7 @@
 """The scenes that the kernels are timed on: splats on the surfaces of a torus, a sphere and a disc of ground.
 
-They look like what training leaves behind: flat along the normal, as wide as their neighbours are far, a few much
-wider, every band of the spherical harmonics in use, in Morton order, and all in view.
+They resemble a trained scene: flat along the normal, as wide as the distance to their neighbors, a few much wider, with
+every band of the spherical harmonics, in Morton order, and all in view.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ EYE = (2.6, -3.0, 2.4)
 
 
 def surface_scene(count: int, width: int, height: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
-    """`count` splats of SH degree 3 and one camera that sees them all. Same numbers, same scene."""
+    """`count` splats of SH degree 3 and one camera that sees them all; equal arguments give equal scenes."""
     rng = torch.Generator().manual_seed(seed)
     points, normals = surface_points(count, rng)
     order = morton_order(points)
@@ -63,7 +63,7 @@ def surface_points(count: int, rng: torch.Generator) -> tuple[Float[Tensor, "N 3
 
 def torus(count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     around = 2 * math.pi * torch.rand(count, generator=rng)
-    # Area grows with the distance from the axis: of four angles per point enough pass the test of Williamson (1987).
+    # Area grows with the distance from the axis: rejection sampling of the tube angle (Williamson 1987).
     tube, keep = (
         torch.rand(2, 8 * count, generator=rng) * torch.tensor([[2 * math.pi], [1 + TUBE_RADIUS / TORUS_RADIUS]])
     ).unbind()

@@ -1,4 +1,5 @@
-"""Measure gsopt on this machine, and draw what was measured. `gsopt bench --suite NAME --help`: whole benchmarks."""
+"""Measure gsopt on this machine, and draw the results. Whole benchmarks, also of your own scenes (FILE.toml): see
+`gsopt bench --suite NAME --help`."""
 
 from __future__ import annotations
 
@@ -78,12 +79,12 @@ class Draw:
 class Suite:
     """Train every arm on every scene of a suite and record all figures; runs that have a record are not made again."""
 
-    suite: Annotated[str, arg(metavar="sparse|paper|smoke")]
-    """Which one: gsopt/benchmark/suites has their declarations."""
+    suite: Annotated[str, arg(metavar="sparse|paper|smoke|FILE.toml")]
+    """A built-in suite, or a file that declares one of your own scenes as gsopt/benchmark/suites/smoke.toml does."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="FILE.json")]
     """Result file, written after every run; at the end FILE.html is drawn beside it."""
     root: Annotated[Path | None, arg(metavar="DATA")] = None
-    """Folder that holds the suite's scenes; smoke brings its own."""
+    """Folder that holds the suite's scenes; smoke brings its own, FILE.toml has them beside it when not given."""
     seeds: int = 3
     """Seeds 0 to N-1 of every run, the first of all runs before the second."""
     arms: Annotated[tuple[str, ...], arg(metavar="ARM")] = ()
@@ -245,7 +246,7 @@ def suite(flags: Suite) -> int:
     prior = str(folder.absolute()) if flags.prior and folder.is_dir() else flags.prior
     options = SuiteContext(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
     command = suite_command(flags)
-    failed = run_suite(output, whole.name, command, cases, options, lambda text: print(text, flush=True))
+    failed = run_suite(output, whole, command, cases, options, lambda text: print(text, flush=True))
     drawn = output.with_suffix(".html")
     write_html(result_file.read(output), result_file.read_pictures(output), drawn)
     print(f"Written: {output}, {drawn}")
@@ -254,7 +255,7 @@ def suite(flags: Suite) -> int:
 
 def suite_command(flags: Suite) -> str:
     """The call as it stands with the results: folders of this machine say nothing to others."""
-    words = ["gsopt", "bench", "--suite", flags.suite, *(("--root", "DATA") if flags.root else ())]
+    words = ["gsopt", "bench", "--suite", Path(flags.suite).name, *(("--root", "DATA") if flags.root else ())]
     words += ["--seeds", str(flags.seeds), *(("--arms", *flags.arms) if flags.arms else ())]
     words += ["--groups", *flags.groups] if flags.groups else []
     words += ["--prior", Path(flags.prior).name] if flags.prior else []

@@ -66,7 +66,7 @@ def test_the_published_settings_are_defined_once() -> None:
 
 @pytest.mark.parametrize("text", ["", "groups = 3\ntitle='a'\nabout='b'", "title = ", "[[groups]]\nname = 'x'"])
 def test_a_broken_declaration_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="must be"):
         definition.parse(text, "mine")
 
 
@@ -160,7 +160,7 @@ def test_code_is_what_takes_part_in_a_run_and_not_what_draws_it(tmp_path: Path) 
 
 def test_what_only_draws_exists() -> None:
     package = run_key.PACKAGE
-    assert all((package / name).exists() for name in run_key.DRAWING)
+    assert all((package / name).exists() for name in run_key.PRESENTATION_FILES)
 
 
 # Statistics

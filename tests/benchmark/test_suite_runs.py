@@ -68,7 +68,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def go(tmp_path: Path, context: SuiteContext, cases: list[definition.Case] = CASES) -> list[str]:
     run_key.folder_hash.cache_clear()
-    return runner.run_suite(tmp_path / "r.json", "sparse", "c", cases, context, lambda text: None)
+    return runner.run_suite(tmp_path / "r.json", definition.load("sparse"), "c", cases, context, lambda text: None)
 
 
 def test_nothing_is_made_twice(tmp_path: Path, context: SuiteContext, made: list[str]) -> None:

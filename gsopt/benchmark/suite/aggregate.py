@@ -1,4 +1,4 @@
-"""What the runs of a suite say together: means over scenes, paired differences with intervals, seconds to a quality."""
+"""Statistics over the runs of a suite: means over scenes, paired differences with intervals, time to a quality."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Variant = tuple[str, int]
 
 @dataclass(frozen=True)
 class Difference:
-    """Of one metric, one arm less another, over the same scenes."""
+    """Difference of two variants in one metric over the same scenes."""
 
     mean: float
     half: float | None
-    """Half the width of the confidence interval; None for a single value."""
+    """Half width of the confidence interval; None for a single value."""
     lowest: float
     highest: float
     positive: int
-    """Scenes (or seeds of a single scene) where it is above 0."""
+    """Number of scenes (or of seeds of a single scene) with a difference above 0."""
     count: int
 
 
@@ -45,8 +45,8 @@ def by_scene(runs: Sequence[Run], metric: str) -> dict[str, float]:
 
 
 def differences(runs: Sequence[Run], a: Variant, b: Variant, metric: str) -> list[float]:
-    """Of a less b, paired by scene and seed. Seeds of one scene are no independent looks at the world: they are
-    averaged first, and the values are those of scenes. With a single scene they are those of its seeds."""
+    """Values of a minus b, paired by scene and seed: one per scene, because seeds of one scene are not independent and
+    are averaged first, or one per seed when there is a single scene."""
     others = {(run["scene"], run["seed"]): run["mean"][metric] for run in runs if variant(run) == b}
     pairs: dict[str, list[float]] = {}
     for run in runs:
@@ -59,7 +59,7 @@ def differences(runs: Sequence[Run], a: Variant, b: Variant, metric: str) -> lis
 
 
 def summarized(values: Sequence[float]) -> Difference | None:
-    """Mean and Student's confidence interval; None without values."""
+    """Mean and Student's confidence interval, or None without values."""
     if not values:
         return None
     mean, half = statistics.fmean(values), None
@@ -91,7 +91,7 @@ def t_quantile(p: float, degrees: int) -> float:
 
 
 def seconds_to_psnr(curve: Sequence[Mapping[str, Any]], psnr: float) -> float | None:
-    """CPU seconds until a run's course reaches that quality, linear between two looks; None when it never does."""
+    """CPU seconds until a run reaches that PSNR, linear between two evaluations, or None when it never does."""
     before: Mapping[str, Any] | None = None
     for point in curve:
         if point["psnr"] >= psnr:
@@ -104,8 +104,8 @@ def seconds_to_psnr(curve: Sequence[Mapping[str, Any]], psnr: float) -> float | 
 
 
 def times_to_match(runs: Sequence[Run], a: Variant, base: Variant) -> tuple[list[float], int]:
-    """CPU seconds of each run of `a` until it is as good as the paired run of `base` ends (both by the views of the
-    curve), and how many pairs there are; runs that never get there have no seconds."""
+    """(CPU seconds of the runs of `a` that reach the final PSNR of the paired run of `base`, number of pairs), by the
+    views of the curve."""
     goals = {(run["scene"], run["seed"]): run["curve"][-1]["psnr"] for run in runs if variant(run) == base}
     pairs = [run for run in runs if variant(run) == a and (run["scene"], run["seed"]) in goals]
     times = [seconds_to_psnr(run["curve"], goals[run["scene"], run["seed"]]) for run in pairs]
@@ -124,7 +124,7 @@ def mean_curve(runs: Sequence[Run], metric: str) -> list[tuple[float, float]]:
 
 
 def complete(runs: Sequence[Run], variants: Sequence[Variant]) -> list[Variant]:
-    """`variants` without arms of words that lack a scene or seed: of some a language model has nothing to say."""
+    """`variants` without prompted arms that lack a scene or seed: a language model may have no prompt for a scene."""
     made = {one: {(run["scene"], run["seed"]) for run in runs if variant(run) == one} for one in variants}
     every = set().union(*made.values())
     return [one for one in variants if one[0] not in arm_flags.PROMPT_SOURCES or made[one] == every]

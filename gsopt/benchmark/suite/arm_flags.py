@@ -1,4 +1,4 @@
-"""The arms of a suite: what each adds to `gsopt train`, in flags a person could type."""
+"""The arms of a suite: the flags that each adds to `gsopt train`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ PUBLISHED_SETTINGS = (
     "--schedule.coarse-until",
     *("--max-gaussians", "1000000"),
 )
-"""The settings of Kerbl et al. 2023, nothing of ours: 100,000 random points (a group of real captures says `--init
-points`), their rates, full resolution from the first step, no regularizer for few views, no guidance."""
+"""The settings of Kerbl et al. 2023: 100,000 random points (groups of real captures add `--init points`), their
+learning rates, full resolution from the first step, no regularizer for few views, no guidance."""
 
 ARMS: dict[str, tuple[str, ...]] = {
     "3dgs": PUBLISHED_SETTINGS,
@@ -29,15 +29,15 @@ ARMS: dict[str, tuple[str, ...]] = {
     "ours-template": (),
     "ours-llm": (),
 }
-"""3dgs: published settings; ours-0: ours without guidance; ours: the default, guided without words; the others: guided
-with the user's own words, those of the template, those of a language model."""
+"""3dgs: published settings; ours-0: ours without guidance; ours: the default, guided without prompts; the others:
+guided with prompts of the user, of the template, of a language model."""
 
 PROMPT_SOURCES = {"ours-user": "user", "ours-template": "template", "ours-llm": "llm:"}
-"""Arms that guide with words, and how the source of their prompts begins in prompts.json."""
+"""Arms guided with prompts, and the prefix of their prompts' `source` in prompts.json."""
 
 
 def is_guided(arm: str) -> bool:
-    """Whether a diffusion prior has a say in this arm."""
+    """True when a diffusion prior may guide this arm."""
     return not {"--lambda-sds", "--lambda_sds"} & set(ARMS[arm])
 
 

@@ -1,42 +1,61 @@
-"""A suite: which scenes are learned how, declared in gsopt/benchmark/suites/NAME.toml, and the list of its runs."""
+"""A suite: the scenes and arms that a TOML file declares, and the list of its runs."""
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from gsopt import check
+from gsopt.benchmark import schema
 from gsopt.benchmark.suite import arm_flags
+from gsopt.data.files import is_regular
 from gsopt.errors import InputError, UsageError
 
 BUILT_IN_SUITES = ("sparse", "paper", "smoke")
 PACKAGE = Path(__file__).resolve().parents[2]
 EVALUATIONS = 5
-"""How often a run is judged on its way, its end included."""
+"""Evaluations during a run, the one at its end included."""
+MAX_TOML_BYTES = 1 << 20
+GROUP = {"name": str, "title": str, "why": str, "scenes": [str], "views": [(int, str)], "runs": [str]}
+GROUP |= {"flags": [str], "get": str}
+OPTIONAL: dict[str, Any] = {"why": "", "flags": [], "get": ""}
+SUITE = {"title": str, "about": str, "root": str, "groups": [GROUP]}
+PATTERNS = {
+    "name": (r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", "letters, digits, `-`, `_` and `.`"),
+    "scenes": (r"(?!(.*/)?\.\.(/|$))[^/|\\\0][^|\\\0]*", "folders below the root"),
+    "views": (r"all|[1-9][0-9]{0,5}|[0-9]{1,6}(,[0-9]{1,6})+", '"all", a number of views, or ids such as "2,16"'),
+    "runs": (r"[a-z0-9-]+ +[1-9][0-9]{0,6}", 'an arm and its steps, such as "ours 3000"'),
+    "flags": (
+        r"(?!(-m|--run|--model[-_]path|-s|--source[-_]path|--iterations|--seed|--views|--view[-_]ids)(=|$)).+",
+        "flags of `gsopt train` that the suite does not set itself",
+    ),
+}
+"""Values of a group: names become parts of file names, scenes and runs parts of ids."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Scenes that are learned alike and stand in one table."""
+    """Scenes that are trained alike and share one table."""
 
     name: str
     title: str
     why: str
-    """One sentence for the reader: what the group asks, and why its lengths are what they are."""
+    """Question of the group and the reason for its lengths, in one sentence."""
     scenes: tuple[str, ...]
     """Folders below the root."""
     views: tuple[str, ...]
-    """`all`, a number of well spread input views, or their ids."""
+    """`all`, a number of evenly spread input views, or their ids."""
     runs: tuple[tuple[str, int], ...]
-    """Arm and number of steps; the first is what the others are compared with."""
+    """Arm and number of steps; the first is the baseline."""
     flags: tuple[str, ...]
-    """Of every run, after those of the arm."""
+    """Further flags of every run, after those of the arm."""
     get: str
-    """What to do when its scenes are missing."""
+    """Instruction for a reader whose root lacks the scenes."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +66,12 @@ class Suite:
     title: str
     about: str
     root: Path | None
-    """Where its scenes ship with gsopt; None where the user says."""
+    """Folder of scenes that ship with gsopt; None where the user names it."""
     groups: tuple[Group, ...]
+    declaration: str | None = None
+    """Text of a suite of one's own, which its result file repeats; None for a built-in suite."""
+    folder: Path | None = None
+    """Folder of that file, which holds its scenes when no other root is given."""
 
 
 @dataclass(frozen=True)
@@ -62,60 +85,93 @@ class Case:
     iterations: int
     seed: int
     flags: tuple[str, ...]
-    """Of `gsopt train`, without the folders and what is made for this machine."""
+    """Flags of `gsopt train`, without folders and without flags that only this machine needs."""
 
     @property
     def id(self) -> str:
-        """Names the run in the result file: two cases with one id are the same run."""
+        """Name of the run in the result file: two cases with one id are the same run."""
         return f"{self.group}|{self.scene}|{self.views}|{self.arm}|{self.iterations}|{self.seed}"
 
 
 def load(name: str) -> Suite:
-    """The suite of that name; UsageError for an unknown one."""
-    check.one_of("--suite", name, BUILT_IN_SUITES)
+    """The built-in suite of that name, or the suite that the file `name` declares."""
+    if name.endswith(".toml"):
+        path = Path(name).expanduser()
+        return replace(parse_own(_read(path), path.stem), folder=path.parent)
+    check.one_of("--suite", name, (*BUILT_IN_SUITES, "FILE.toml"))
     return parse((resources.files("gsopt.benchmark") / "suites" / f"{name}.toml").read_text(encoding="utf-8"), name)
 
 
-def parse(text: str, name: str) -> Suite:
-    """InputError where the declaration is not one."""
+def _read(path: Path) -> str:
+    if not is_regular(path) or path.stat().st_size > MAX_TOML_BYTES:
+        raise InputError(f"`--suite` must be a file of at most {MAX_TOML_BYTES:,} bytes, got {path}. Check the path.")
     try:
-        document = tomllib.loads(text)
-        root = PACKAGE if document.get("root") == "package" else None
-        groups = tuple(_group(values) for values in document["groups"])
-        suite = Suite(name, document["title"], document["about"].strip(), root, groups)
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            f"The suite {name} cannot be read: {error!r}. See gsopt/benchmark/suites for the form."
-        ) from error
-    return suite
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} must be UTF-8 text, got {error}. Save it again as UTF-8.") from error
 
 
-def _group(values: dict[str, Any]) -> Group:
-    runs = tuple((arm, int(steps)) for arm, steps in (text.split() for text in values["runs"]))
+def of_document(document: dict[str, Any]) -> Suite:
+    """The suite whose runs a result file holds."""
+    text = document.get("declaration")
+    return load(document["suite"]) if text is None else parse_own(text, document["suite"])
+
+
+def parse_own(text: str, name: str) -> Suite:
+    """A suite of one's own; InputError also for a name that no file may have or a built-in suite has."""
+    if name in BUILT_IN_SUITES:
+        raise InputError(f"A suite of your own must not be named {name}, got {name}.toml. Rename the file.")
+    _match("suite", "name", name)
+    return replace(parse(text, name), declaration=text)
+
+
+def parse(text: str, name: str) -> Suite:
+    """InputError that names the first wrong entry."""
+    try:
+        document = {"root": "", **tomllib.loads(text)}
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"The suite {name} must be valid TOML, got {error}. Correct the file.") from error
+    if isinstance(document.get("groups"), list):
+        document["groups"] = [OPTIONAL | group if isinstance(group, dict) else group for group in document["groups"]]
+    schema.require(document, SUITE, name)
+    names = [group["name"] for group in document["groups"]]
+    if not names or len(set(names)) < len(names):
+        raise InputError(f"`{name}.groups` must be groups with different names, got {names}. Correct the file.")
+    if document["root"] not in ("", "package"):
+        got = document["root"]
+        raise InputError(f'`{name}.root` must be "package" or absent, got {got!r}. Name a folder with --root.')
+    groups = tuple(_group(values, f"{name}.{values['name'][:40]}") for values in document["groups"])
+    root = PACKAGE if document["root"] else None
+    return Suite(name, document["title"], document["about"].strip(), root, groups)
+
+
+def _match(where: str, key: str, value: object) -> None:
+    pattern, want = PATTERNS[key]
+    if not re.fullmatch(pattern, str(value)):
+        raise InputError(f"`{where}.{key}` must be {want}, got {str(value)[:80]!r}. Correct the file.")
+
+
+def _group(values: dict[str, Any], where: str) -> Group:
+    lists = {key: tuple(map(str, values[key])) for key in ("scenes", "views", "runs", "flags")}
+    for key, found in (("name", [values["name"]]), *lists.items()):
+        for value in found:
+            _match(where, key, value)
+    runs = tuple((arm, int(steps)) for arm, steps in map(str.split, lists.pop("runs")))
     arm_flags.require(tuple(arm for arm, _ in runs))
-    return Group(
-        name=values["name"],
-        title=values["title"],
-        why=values["why"],
-        scenes=tuple(values["scenes"]),
-        views=tuple(str(views) for views in values["views"]),
-        runs=runs,
-        flags=tuple(values.get("flags", ())),
-        get=values["get"],
-    )
+    return Group(**{**values, **lists, "runs": runs})
 
 
 def with_groups(suite: Suite, groups: Sequence[str]) -> Suite:
-    """The suite with these groups only, all when none is named."""
+    """The suite with these groups only; all of them when none is named."""
     names = tuple(group.name for group in suite.groups)
     for name in groups:
         check.one_of("--groups", name, names)
     kept = tuple(group for group in suite.groups if not groups or group.name in groups)
-    return Suite(suite.name, suite.title, suite.about, suite.root, kept)
+    return replace(suite, groups=kept)
 
 
 def cases(suite: Suite, seeds: int, arms: Sequence[str] = ()) -> Iterator[Case]:
-    """Every run: a seed through all groups before the next seed, so that what is there early already says something."""
+    """Every run, one seed through all groups before the next, so that early results cover the whole suite."""
     arm_flags.require(tuple(arms))
     for seed in range(seeds):
         for group in suite.groups:
@@ -135,22 +191,21 @@ def _view_flags(views: str) -> tuple[str, ...]:
 
 
 def view_count(views: str) -> str:
-    """all, or how many."""
+    """`all`, or the number of views."""
     return str(len(views.split(","))) if "," in views else views
 
 
 def find_root(suite: Suite, given: Path | None) -> Path:
-    """Where the scenes lie; errors name those that are missing and say how to get them."""
-    if suite.root is None and given is None:
+    """Folder of the scenes: the package, `given`, or the folder of the suite's file; errors name the missing scenes."""
+    root = suite.root or given or suite.folder
+    if root is None:
         folders = ", ".join(sorted({scene.split("/")[0] for group in suite.groups for scene in group.scenes}))
         raise UsageError(f"The suite {suite.name} needs `--root`, got none. Give the folder that holds {folders}.")
-    root = given if suite.root is None else suite.root
-    assert root is not None
     for group in suite.groups:
         missing = [scene for scene in group.scenes if not (root / scene).is_dir()]
         if missing:
             raise InputError(
                 f"{root} lacks {', '.join(missing)}, wanted by the group {group.name} of the suite {suite.name}. "
-                f"{group.get} Or name other groups with --groups."
+                f"{group.get or 'Name the folder that has them with --root.'} Or name other groups with --groups."
             )
     return root.absolute()

@@ -1,4 +1,4 @@
-"""One page of a suite that needs no other file: tables, charts and the grid of pictures."""
+"""One self-contained page of a suite: tables, charts and the grid of renders."""
 
 from __future__ import annotations
 
@@ -20,15 +20,14 @@ from gsopt.benchmark.suite.tables import GroupSection, about, group_sections, mi
 from gsopt.errors import InputError
 from gsopt.events import write_atomic
 
-# Nothing may be loaded from anywhere: pictures are data URIs, styles stand in the page, there are no scripts.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 STYLE = (
     ".grid{border-spacing:6px;border-collapse:separate}.grid td{padding:0;vertical-align:top;text-align:center}"
     ".grid img{display:block;width:150px;height:auto}.grid td.none{color:#888}svg{max-width:540px;height:auto}"
     ".charts{display:flex;flex-wrap:wrap;gap:1rem}"
 )
-PREFIX = "data:image/webp;base64,"
-CELL, ROOM, QUALITY = 150, 6, 85
+WEBP_PREFIX = "data:image/webp;base64,"
+CELL_SIDE, CELL_GAP, JPEG_QUALITY = 150, 6, 85
 
 
 def write_html(document: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
@@ -37,7 +36,7 @@ def write_html(document: dict[str, Any], pictures: dict[str, Any], path: Path) -
 
 
 def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
-    suite = declared.load(document["suite"])
+    suite = declared.of_document(document)
     style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
     lines = "".join(f"<p>{marked(line)}</p>" for line in about(document))
     sections = "".join(section(made, pictures) for made in group_sections(document))
@@ -55,12 +54,12 @@ def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
 
 
 def marked(text: str) -> str:
-    """Escaped, with what stands between backticks as code."""
+    """Escaped text, with code between backticks."""
     return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
 
 
 def section(made: GroupSection, pictures: dict[str, Any]) -> str:
-    """A group: tables, charts, pictures."""
+    """A group's tables, charts and renders."""
     out = [f"<section><h2>{escape(made.title)}</h2><p>{marked(' '.join(made.lines))}</p>"]
     for note, (head, rows) in made.tables:
         cells = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
@@ -72,7 +71,7 @@ def section(made: GroupSection, pictures: dict[str, Any]) -> str:
 
 
 def grid(made: GroupSection, pictures: dict[str, Any]) -> str:
-    """Input, every arm with its error below, truth; '' without pictures."""
+    """Rows of input, every arm with its error below, truth; empty without images."""
     rows = "".join(grid_row(made, scene, pictures) for scene in made.scenes)
     if not rows:
         return ""
@@ -97,14 +96,14 @@ def grid_row(made: GroupSection, scene: str, pictures: dict[str, Any]) -> str:
 
 
 def find(pictures: dict[str, Any], scene: str, views: str, one: Variant) -> dict[str, Any] | None:
-    """Pictures of a run of seed 0, whatever its group."""
+    """Images of a run of seed 0 in any group."""
     ending = f"|{scene}|{views}|{one[0]}|{one[1]}|0"
     return next((value for key, value in pictures.items() if key.endswith(ending)), None)
 
 
 def _cell(found: dict[str, Any], *names: str) -> str:
     sources = [str(found.get(name, "")) for name in names]
-    shown = "".join(f'<img loading="lazy" src="{escape(s)}" alt="">' for s in sources if s.startswith(PREFIX))
+    shown = "".join(f'<img loading="lazy" src="{escape(s)}" alt="">' for s in sources if s.startswith(WEBP_PREFIX))
     return f"<td>{shown}</td>"
 
 
@@ -114,19 +113,24 @@ def write_grid(document: dict[str, Any], pictures: dict[str, Any], path: Path, m
     for made in group_sections(document):
         rows = [row for scene in made.scenes if (row := _pictures(made, scene, pictures))][:most]
         if rows:
-            sheet = Image.new("RGB", (len(rows[0]) * (CELL + ROOM), len(rows) * (CELL + ROOM)), "white")
+            sheet = Image.new(
+                "RGB", (len(rows[0]) * (CELL_SIDE + CELL_GAP), len(rows) * (CELL_SIDE + CELL_GAP)), "white"
+            )
             for y, row in enumerate(rows):
                 for x, uri in enumerate(row):
-                    sheet.paste(decoded(uri).resize((CELL, CELL)), (x * (CELL + ROOM), y * (CELL + ROOM)))
+                    sheet.paste(
+                        decoded(uri).resize((CELL_SIDE, CELL_SIDE)),
+                        (x * (CELL_SIDE + CELL_GAP), y * (CELL_SIDE + CELL_GAP)),
+                    )
             buffer = io.BytesIO()
-            sheet.save(buffer, format="JPEG", quality=QUALITY)
+            sheet.save(buffer, format="JPEG", quality=JPEG_QUALITY)
             write_atomic(path, buffer.getvalue())
             return True
     return False
 
 
 def _pictures(made: GroupSection, scene: str, pictures: dict[str, Any]) -> Sequence[str]:
-    """Data URIs of a whole row; () when one is missing."""
+    """Data URIs of a whole row, empty when one is missing."""
     steps = made.variants[0][1]
     shared = pictures.get(f"{scene}|{made.views}")
     found = [find(pictures, scene, made.views, (arm, steps)) for arm in ("3dgs", "ours-0", "ours")]
@@ -137,11 +141,13 @@ def _pictures(made: GroupSection, scene: str, pictures: dict[str, Any]) -> Seque
 
 
 def decoded(uri: str) -> Image.Image:
-    """The picture of a data URI that `gsopt bench` wrote; InputError for anything else."""
+    """The image of a data URI that `gsopt bench` wrote; InputError for anything else."""
     try:
-        if not uri.startswith(PREFIX):
+        if not uri.startswith(WEBP_PREFIX):
             raise ValueError("no WebP data URI")
-        with Image.open(io.BytesIO(base64.b64decode(uri[len(PREFIX) :], validate=True)), formats=("WEBP",)) as image:
+        with Image.open(
+            io.BytesIO(base64.b64decode(uri[len(WEBP_PREFIX) :], validate=True)), formats=("WEBP",)
+        ) as image:
             return image.convert("RGB")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"A picture of the suite cannot be read: {error}. Make its runs again.") from error

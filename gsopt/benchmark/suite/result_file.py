@@ -1,4 +1,4 @@
-"""The result file of a suite: every run with all its figures, written whole after each run. Pictures lie beside it."""
+"""The result file of a suite: all figures of every run, written whole after each, and the images beside it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark import schema
-from gsopt.benchmark.suite.definition import BUILT_IN_SUITES
+from gsopt.benchmark.suite.definition import BUILT_IN_SUITES, Suite
 from gsopt.data.files import read_json
 from gsopt.errors import InputError, UsageError
 from gsopt.events import write_atomic
@@ -20,7 +20,7 @@ METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "mask_iou", "depth_error")
 NUMBERS = [(float, None)]
 MACHINE = {key: kind for key, kind in schema.MACHINE.items() if key != "load"}
 CURVE_POINT = {"step": int, "cpu_seconds": float, "gaussians": int, "psnr": float, "lpips_alex": (float, None)}
-"""Held-out quality of one moment; seconds count reading, first Gaussians and the guard, not the interpreter's start."""
+"""Held-out quality at one step; seconds count reading, first Gaussians and the guard, not the interpreter's start."""
 RUN = {
     "group": str,
     "scene": str,
@@ -62,47 +62,44 @@ ID = ("group", "scene", "views", "arm", "iterations", "seed")
 
 
 def run_id(record: dict[str, Any]) -> str:
-    """As `suite.Case.id`."""
+    """Equals `definition.Case.id`."""
     return "|".join(str(record[name]) for name in ID)
 
 
-def empty(suite: str, command: str) -> dict[str, Any]:
-    return {
-        "version": VERSION,
-        "suite": suite,
-        "command": command,
-        "machines": [],
-        "protocols": [],
-        "runs": [],
-        "skipped": [],
-    }
+def shape(document: Document) -> schema.Schema:
+    """The schema of a result file; one of a suite of one's own repeats its declaration."""
+    return DOCUMENT | ({"declaration": str} if "declaration" in document else {})
+
+
+def empty(suite: str, command: str) -> Document:
+    lists: Document = {"machines": [], "protocols": [], "runs": [], "skipped": []}
+    return {"version": VERSION, "suite": suite, "command": command, **lists}
 
 
 def read(path: Path) -> dict[str, Any]:
     """InputError for a file that is broken or holds something else."""
     document = read_json(path)
-    if document.get("suite") not in BUILT_IN_SUITES:
+    if document.get("suite") not in BUILT_IN_SUITES and "declaration" not in document:
         got = str(document.get("suite"))[:40]
         raise InputError(f"{path} must hold results of a suite, got suite {got!r}. Name another file with -o.")
-    schema.require(document, DOCUMENT, path.name)
+    schema.require(document, shape(document), path.name)
     return document
 
 
-def opened(path: Path, suite: str, command: str) -> dict[str, Any]:
-    """The results so far; an empty document for a new file. UsageError when the file belongs to another suite."""
-    if not path.exists():
-        return empty(suite, command)
-    document = read(path)
-    if document["suite"] != suite:
+def opened(path: Path, suite: Suite, command: str) -> Document:
+    """The results so far, or an empty document for a new file; UsageError when the file belongs to another suite."""
+    document = read(path) if path.exists() else empty(suite.name, command)
+    if document["suite"] != suite.name:
         raise UsageError(
-            f"`-o {path}` holds results of the suite {document['suite']}, got --suite {suite}. Name another file."
+            f"`-o {path}` holds results of the suite {document['suite']}, got --suite {suite.name}. Name another file."
         )
-    return {**document, "command": command}
+    own = {} if suite.declaration is None else {"declaration": suite.declaration}
+    return {**document, "command": command, **own}
 
 
 def write(path: Path, document: dict[str, Any]) -> None:
-    """Whole or not at all, one run a line; refused when it departs from the schema."""
-    schema.require(document, DOCUMENT)
+    """Writes the whole file or nothing, one run per line; refuses what departs from the schema."""
+    schema.require(document, shape(document))
     write_atomic(path, compact(document))
 
 
@@ -144,13 +141,13 @@ def with_run(document: Document, record: Document, machine: Document, protocol: 
 
 
 def with_skip(document: Document, record: Document) -> Document:
-    """The document with this run among those left out, for the reason told."""
+    """The document with this run among the skipped ones, with its reason."""
     kept = [skip for skip in document["skipped"] if run_id(skip) != run_id(record)]
     return {**document, "skipped": [*kept, record]}
 
 
 def pictures_path(path: Path) -> Path:
-    """Where the pictures of a result file lie."""
+    """Path of the images of a result file."""
     return path.with_name(f"{path.stem}-pictures.json")
 
 
@@ -165,7 +162,7 @@ def write_pictures(path: Path, pictures: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """One writer per result file; the lock goes with the process. Not available on Windows."""
+    """Allows one writer per result file until the process ends. Has no effect on Windows."""
     try:
         import fcntl
     except ImportError:

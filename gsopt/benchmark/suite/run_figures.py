@@ -1,4 +1,4 @@
-"""What a suite looks at in a finished run beside metrics.json: its course, its shape, its pictures."""
+"""Figures of a finished run beside metrics.json: quality over time, masks and depth, images for the page."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from gsopt.results.report.embedded_images import data_uri, error_map, shrunk
 from gsopt.results.video import as_image
 
 CURVE_VIEWS = 8
-"""Held-out views that are judged on the way, evenly spread."""
+"""Held-out views that are evaluated during the run, evenly spread."""
 MASK_ALPHA = 0.5
-"""A pixel with more alpha than this belongs to the object."""
+"""Alpha above which a pixel belongs to the object."""
 IMAGE_SIDE = 256
 MAX_DEPTH_BYTES = 1 << 28
 
@@ -31,7 +31,7 @@ Event = Mapping[str, Any]
 
 @torch.no_grad()
 def curve(finished: FinishedRun, scene: Scene, events: Sequence[Event], setup: float) -> list[dict[str, Any]]:
-    """Held-out quality at every preview and at the end (`suite_file.CURVE_POINT`), over CPU seconds."""
+    """Held-out quality at every preview and at the end (`result_file.CURVE_POINT`), over CPU seconds."""
     count = min(CURVE_VIEWS, len(scene.test))
     views = [scene.test[i * len(scene.test) // count] for i in range(count)]
     steps = int(events[-1]["step"])
@@ -51,7 +51,7 @@ def curve(finished: FinishedRun, scene: Scene, events: Sequence[Event], setup: f
 
 @torch.no_grad()
 def shape(finished: FinishedRun, scene: Scene) -> dict[str, list[float | None]]:
-    """Per held-out view: overlap of silhouettes, and mean depth error in scene units; None without truth for it."""
+    """Mask IoU and mean depth error (scene units) per held-out view; None where the truth is missing."""
     rows = [_shape_of(finished, scene, view) for view in scene.test]
     return {"mask_iou": [iou for iou, _ in rows], "depth_error": [depth for _, depth in rows]}
 
@@ -81,8 +81,8 @@ def overlap(a: Tensor, b: Tensor) -> float:
 
 
 def read_depth(root: Path, view: View) -> Float[Tensor, "H W"] | None:
-    """depth/NAME.npy as synth_views writes it: z in scene units, 0 where nothing is. None where there is none that
-    fits the view's size, or that is no plain array of numbers."""
+    """Depth map depth/NAME.npy as synth_views writes it: z in scene units, 0 in empty space. Returns None for a missing
+    file, another size, or anything but a plain array of numbers."""
     path = root / "depth" / f"{Path(view.name).stem}.npy"
     if not path.is_file() or path.stat().st_size > MAX_DEPTH_BYTES:
         return None
@@ -97,8 +97,8 @@ def read_depth(root: Path, view: View) -> Float[Tensor, "H W"] | None:
 
 @torch.no_grad()
 def pictures(finished: FinishedRun, scene: Scene) -> tuple[dict[str, str], dict[str, str]]:
-    """What a scene's row of the grid needs, and what this run adds: the held-out view that stands farthest from all
-    input views (chosen without looking at any result), and the input view nearest to it."""
+    """(images that all runs of a scene share, images of this run), as data URIs: the held-out view that is farthest
+    from all input views, a choice that depends on no result, and the input view nearest to it."""
     view, nearest = remote_view(scene)
     target, picture = as_image(truth(view, finished.background)), as_image(finished.draw(view.camera))
     shared = {"view": view.name, "truth": data_uri(shrunk(target, IMAGE_SIDE)), "input_view": nearest.name}

@@ -1,4 +1,4 @@
-"""When a recorded run is still the run that would be made: hashes of its settings, its data and the code."""
+"""Hashes of a run's settings, data and code: a record with the same key need not be measured again."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 from gsopt.errors import InputError
 
 PACKAGE = Path(__file__).resolve().parents[2]
-CODE = (".py", ".so", ".pyd", ".npz")
-"""What a run executes or is judged with: sources, the compiled extension, the weights of LPIPS."""
-DRAWING = (
+CODE_SUFFIXES = (".py", ".so", ".pyd", ".npz")
+"""Suffixes of files that training or evaluation depend on: sources, the compiled extension, the weights of LPIPS."""
+PRESENTATION_FILES = (
     "results/report/",
     "results/viewer.py",
     "benchmark/charts.py",
@@ -22,9 +22,9 @@ DRAWING = (
     "benchmark/suite/html_page.py",
     "benchmark/suite/aggregate.py",
 )
-"""Files that only show what was measured: a better table is no reason to measure again."""
-DIGITS = 16
-CHUNK = 1 << 20
+"""Files that only present results: a better table is no reason to measure again."""
+KEY_DIGITS = 16
+READ_BYTES = 1 << 20
 
 
 def key(config: Sequence[str], data: str, code: str) -> str:
@@ -33,12 +33,12 @@ def key(config: Sequence[str], data: str, code: str) -> str:
 
 
 def digest(parts: Iterable[bytes]) -> str:
-    """Of parts, each closed off by its length."""
+    """Hash of parts, each preceded by its length."""
     total = hashlib.sha256()
     for part in parts:
         total.update(len(part).to_bytes(8, "little"))
         total.update(part)
-    return total.hexdigest()[:DIGITS]
+    return total.hexdigest()[:KEY_DIGITS]
 
 
 @cache
@@ -56,7 +56,7 @@ def file_hash(path: Path) -> bytes:
     total = hashlib.sha256()
     try:
         with open(path, "rb") as file:
-            while piece := file.read(CHUNK):
+            while piece := file.read(READ_BYTES):
                 total.update(piece)
     except OSError as error:
         raise InputError(f"Cannot read {path}: {error.strerror}. Restore the file or its permissions.") from error
@@ -65,8 +65,8 @@ def file_hash(path: Path) -> bytes:
 
 @cache
 def code_hash(package: Path = PACKAGE) -> str:
-    """Of everything in the package that takes part in a run."""
-    files = sorted(p for p in package.rglob("*") if p.suffix in CODE and p.is_file())
+    """Hash of every file of the package that a run depends on."""
+    files = sorted(p for p in package.rglob("*") if p.suffix in CODE_SUFFIXES and p.is_file())
     names = ((path.relative_to(package).as_posix(), path) for path in files)
-    used = ((name, path) for name, path in names if not name.startswith(DRAWING))
+    used = ((name, path) for name, path in names if not name.startswith(PRESENTATION_FILES))
     return digest(part for name, path in used for part in (name.encode(), file_hash(path)))

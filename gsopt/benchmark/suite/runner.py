@@ -1,4 +1,4 @@
-"""Makes the runs of a suite that have no record yet, one after the other, and writes after each."""
+"""Executes the runs of a suite that have no record yet, one after the other, and writes the file after each."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import torch
 
 from gsopt.benchmark.machine import machine
 from gsopt.benchmark.suite import result_file, single_run
-from gsopt.benchmark.suite.definition import Case
+from gsopt.benchmark.suite.definition import Case, Suite
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 
 Report = Callable[[str], None]
 
 
 def work_folder(path: Path) -> Path:
-    """Where the runs of a result file lie while they are made."""
+    """Folder of the runs in progress of a result file."""
     return path.with_name(f"{path.stem}-runs")
 
 
 def run_suite(
-    path: Path, suite: str, command: str, cases: Sequence[Case], context: SuiteContext, report: Report
+    path: Path, suite: Suite, command: str, cases: Sequence[Case], context: SuiteContext, report: Report
 ) -> list[str]:
-    """Bring the result file up to date with `cases`; returns what failed. A kill loses the run that was being made.
+    """Brings the result file up to date with `cases` and returns the failed ones. A kill loses only the current run.
 
     Raises UsageError and InputError for a file of another suite or a broken one, before anything is run.
     """
@@ -47,11 +47,11 @@ def run_suite(
 
 
 def _one(path: Path, document: dict[str, Any], case: Case, context: SuiteContext) -> tuple[dict[str, Any], str]:
-    """The document after one case, written when it changed, and what there is to tell."""
+    """(document after one case, written when it changed; line to print)."""
     message, old = "", next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
     if (reason := single_run.reason_to_skip(case, context)) is not None:
         skip = {**_named(case), "reason": reason}
-        if old is not None or skip in document["skipped"]:  # a record made where a prior was at hand stays
+        if old is not None or skip in document["skipped"]:  # keep a record made on a machine that had a prior
             return document, ""
         document = result_file.with_skip(document, skip)
     else:

@@ -1,4 +1,4 @@
-"""One run of a suite: `gsopt train` in a process of its own, then every figure of it as one record."""
+"""One run of a suite: `gsopt train` in a process of its own, and all its figures as one record."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gsopt.results.finished_run import open_run
 from gsopt.sds.select_prior import EMBEDDED, choose, fitting
 
 MAX_ERROR_LINES = 12
-"""Last lines of a failed run's output that are repeated."""
+"""Number of last lines of a failed run's output in its error."""
 
 
 class RunFailed(GsoptError):
@@ -40,20 +40,20 @@ class RunFailed(GsoptError):
 
 @dataclass(frozen=True)
 class SuiteContext:
-    """What the runs of one call share."""
+    """Settings that the runs of one call share."""
 
     root: Path
     work: Path
     """Folder of the runs; each is removed once its record is written."""
     threads: int
     prior: str = ""
-    """Of guided arms; gsopt's own choice when not given."""
+    """Prior of guided arms; gsopt's own choice when empty."""
     llm: str = ""
     model: str = ""
 
 
 def reason_to_skip(case: Case, context: SuiteContext) -> str | None:
-    """Why a run would say nothing; None when it is to be made."""
+    """Reason to skip a run, or None for a run to execute."""
     if not arm_flags.is_guided(case.arm):
         return None
     config = GuidanceConfig(prior=context.prior or "auto")
@@ -81,7 +81,7 @@ def _reason_without_prompts(case: Case, context: SuiteContext, prior: str) -> st
 
 
 def notes(root: Path) -> dict[str, Any]:
-    """By scene what an expert would say: {"notes": ..., "domain": ..., "category": ...}."""
+    """An expert's notes by scene: {"notes": ..., "domain": ..., "category": ...}."""
     from gsopt.data.files import read_json
 
     path = root / "notes.json"
@@ -89,7 +89,7 @@ def notes(root: Path) -> dict[str, Any]:
 
 
 def data_config(case: Case, root: Path) -> DataConfig:
-    """What the flags of the run say about its data."""
+    """Configuration of the data that the flags of the run describe."""
     flags = list(case.flags)
     after = {name: flags[flags.index(name) + 1] for name in ("--views", "--view-ids", "-r") if name in flags}
     ids = tuple(int(part) for part in after["--view-ids"].split(",")) if "--view-ids" in after else None
@@ -99,7 +99,7 @@ def data_config(case: Case, root: Path) -> DataConfig:
 
 
 def settings(case: Case, context: SuiteContext) -> list[str]:
-    """Everything that the run's figures depend on beside its data and the code."""
+    """Everything that the run's figures depend on, besides its data and the code."""
     own = [*case.flags, f"looks={EVALUATIONS}"]
     vgg = find_vgg_weights()
     own.append("vgg=" + ("none" if vgg is None else run_key.file_hash(vgg).hex()))
@@ -118,7 +118,7 @@ def key(case: Case, context: SuiteContext) -> str:
 
 
 def prompts(case: Case, context: SuiteContext) -> Path | None:
-    """The arm's prompts.json, made once per scene; None for an arm without words."""
+    """The arm's prompts.json, generated once per scene; None for an arm without prompts."""
     if case.arm not in arm_flags.PROMPT_SOURCES:
         return None
     note = notes(context.root)[case.scene]
@@ -130,7 +130,7 @@ def prompts(case: Case, context: SuiteContext) -> Path | None:
     path.parent.mkdir(parents=True, exist_ok=True)
     every = path.with_name(f"all-{path.name}")
     domain = str(note.get("domain", "generic"))
-    if (context.root / domain).is_file():  # a template of one's own, named relative to notes.json
+    if (context.root / domain).is_file():  # a custom template, named relative to notes.json
         domain = str((context.root / domain).absolute())
     command = ["prompts", "--notes", str(note["notes"]), "--domain", domain]
     command += ["--category", str(note["category"])] if "category" in note else []
@@ -142,7 +142,7 @@ def prompts(case: Case, context: SuiteContext) -> Path | None:
 
 
 def machine_flags(case: Case, context: SuiteContext) -> list[str]:
-    """Flags that change how fast a run is and where its previews lie, not a bit of its result."""
+    """Flags that change the speed of a run and its previews, but no bit of its result."""
     flags = ["--threads", str(context.threads), "--checkpoint-every", "0"]
     flags += ["--preview-every", str(max(1, case.iterations // EVALUATIONS))]
     if arm_flags.is_guided(case.arm) and context.prior:
@@ -174,7 +174,7 @@ def call(arguments: list[str], log: Path) -> None:
 
 
 def measure(case: Case, context: SuiteContext) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    """Train and judge: the record (`suite_file.RUN` without its references), the protocol, the pictures of seed 0."""
+    """Trains and evaluates: (record as in `result_file.RUN` without references, protocol, images of seed 0)."""
     folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.work))
     try:
         run = folder / "run"
@@ -193,7 +193,7 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
     if events[-1]["kind"] != "done":
         raise RunFailed(f"{case.id} must end with `done`, got {events[-1]['kind']!r}. Call the suite again.")
     if not metrics.get("per_view"):
-        raise InputError(f"{case.scene} holds out no views, so nothing can be judged. Add --eval to its group.")
+        raise InputError(f"{case.scene} holds out no views, so nothing can be evaluated. Add --eval to its group.")
     finished = open_run(run, threads=context.threads)
     scene = load_scene(finished.config.data)
     started = next(event for event in events if event["kind"] == "started")
@@ -230,13 +230,13 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
 
 
 def mean(values: list[float | None]) -> float | None:
-    """Over views; None when one lacks the value."""
+    """Mean over views, or None when a view lacks the value."""
     known = [value for value in values if value is not None]
     return round(sum(known) / len(known), 6) if known and len(known) == len(values) else None
 
 
 def guidance_facts(run: Path) -> dict[str, Any]:
-    """Who guided the run, why, and what the guard made of it."""
+    """The run's prior, the reason for it, and the guard's decision."""
     found = json.loads((run / "config.json").read_bytes()).get("guidance") or {}
     guard = found.get("guard") or {}
     factor = guard.get("factor")

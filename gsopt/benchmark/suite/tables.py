@@ -1,4 +1,4 @@
-"""The tables and charts of a suite, made from its result file alone: as parts that Markdown and HTML both show."""
+"""The tables and charts of a suite, made from its result file alone, in sections for Markdown and HTML."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ Table = tuple[list[str], list[list[str]]]
 
 @dataclass
 class GroupSection:
-    """One group at one number of views: what a page shows of it."""
+    """Tables and charts of one group at one number of views."""
 
     title: str
     lines: list[str] = field(default_factory=list)
     tables: list[tuple[str, Table]] = field(default_factory=list)
-    """With the sentence above each."""
+    """(sentence above the table, table)."""
     charts: dict[str, str] = field(default_factory=dict)
     """SVG by file name without suffix."""
     scenes: list[str] = field(default_factory=list)
-    """Of the picture grid, in the suite's order."""
+    """Rows of the image grid, in the suite's order."""
     views: str = ""
     variants: list[Variant] = field(default_factory=list)
 
 
 def group_sections(document: dict[str, Any]) -> list[GroupSection]:
     """Every group and number of views that has a run, in the suite's order."""
-    suite = declared.load(document["suite"])
+    suite = declared.of_document(document)
     return [
         group_section(suite, group, views, found)
         for group in suite.groups
@@ -58,7 +58,7 @@ def group_sections(document: dict[str, Any]) -> list[GroupSection]:
 
 
 def group_section(suite: Suite, group: Group, views: str, runs: list[Run]) -> GroupSection:
-    """The tables of runs that were learned alike."""
+    """The tables of runs that were trained alike."""
     variants = [one for one in group.runs if any(variant(run) == one for run in runs)]
     several = len(group.views) > 1
     title = group.title + (f": {view_count(views)} views" if several else "")
@@ -112,7 +112,7 @@ def seconds(run: Run) -> float:
 
 
 def comparisons(group: Group, variants: Sequence[Variant]) -> Iterator[tuple[Variant, Variant]]:
-    """Each arm against the group's first; guided against unguided; ours against 3dgs that ran longer."""
+    """Pairs to compare: each variant with the first, guided with unguided arms, ours with longer runs of 3dgs."""
     base = variants[0]
     for one in variants[1:]:
         yield one, base
@@ -125,7 +125,7 @@ def comparisons(group: Group, variants: Sequence[Variant]) -> Iterator[tuple[Var
 
 
 def compared(runs: Sequence[Run], a: Variant, b: Variant) -> list[str]:
-    """A row of the table of differences; [] without a pair."""
+    """A row of the table of differences, empty without a pair."""
     found = {m: aggregate.summarized(aggregate.differences(runs, a, b, m)) for m in COMPARED}
     psnr = found["psnr"]
     if psnr is None:
@@ -151,7 +151,7 @@ def time_row(runs: Sequence[Run], a: Variant, base: Variant) -> list[str]:
 
 
 def scene_rows(runs: Sequence[Run], scenes: Sequence[str], variants: Sequence[Variant]) -> Table:
-    """One row per scene; the seeds that its arms share averaged; what the guard left of the guidance."""
+    """One row per scene: means over the seeds that its arms share, and the guard's factor."""
     rows = []
     for scene in scenes:
         row = [scene.rpartition("/")[2]]
@@ -166,7 +166,7 @@ def scene_rows(runs: Sequence[Run], scenes: Sequence[str], variants: Sequence[Va
 
 
 def charts(stem: str, made: GroupSection, runs: Sequence[Run]) -> dict[str, str]:
-    """Quality over CPU seconds of the arms that lack no scene, over the scenes and seeds that all of these have."""
+    """Quality over CPU seconds of the complete arms, over the scenes and seeds that all of them have."""
     whole = aggregate.complete(runs, made.variants)
     same = aggregate.common(runs, whole)
     if not same:
@@ -180,11 +180,11 @@ def charts(stem: str, made: GroupSection, runs: Sequence[Run]) -> dict[str, str]
 
 
 def about(document: dict[str, Any]) -> list[str]:
-    """Where the figures come from, how they were taken, and what is missing."""
+    """Origin and protocol of the figures."""
     places = [f"{m['cpu']}, {m['cores']} cores, gsopt {m['commit'] or m['gsopt']}" for m in document["machines"]]
     codes = Counter(run["code"] for run in document["runs"])
     mixed = "" if len(codes) < 2 else f" The runs are of {len(codes)} versions of the code: call the suite again."
-    suite = declared.load(document["suite"])
+    suite = declared.of_document(document)
     lines = [suite.about.replace("\n", " "), f"`{document['command']}` on {'; '.join(places)}.{mixed}"]
     lines.append(
         "CPU seconds of all threads: reading, first Gaussians, the guard's short runs and the steps; other work on the "
@@ -196,8 +196,8 @@ def about(document: dict[str, Any]) -> list[str]:
 
 
 def missing(document: dict[str, Any]) -> list[str]:
-    """What the suite declares (three seeds) and the file does not have, and what was skipped and why."""
-    suite = declared.load(document["suite"])
+    """Runs that the suite declares (with three seeds) and the file lacks, and skipped runs with their reasons."""
+    suite = declared.of_document(document)
     have = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["runs"]}
     skipped = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["skipped"]}
     lines, lacking = [], Counter[str]()
@@ -218,7 +218,7 @@ def missing(document: dict[str, Any]) -> list[str]:
 
 
 def write_page(document: dict[str, Any], page: Path) -> None:
-    """Rewrite the block of the suite in a Markdown page and the charts beside it, in img/."""
+    """Rewrites the block of the suite in a Markdown page, and the charts beside it in img/."""
     blocks = [*about(document)]
     for made in group_sections(document):
         blocks += [f"### {made.title}", " ".join(made.lines)]
