@@ -27,7 +27,7 @@ from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.raster.cpu_backend import CpuBackend
 from gsopt.training.checkpoint import load_newest
-from gsopt.training.optimizer import Model, adam_step, learning_rates
+from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
 from gsopt.training.targets import Target, Targets
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,7 +55,7 @@ class State:
         if checkpoint is None:
             raise SystemExit(f"{run} has no checkpoint.")
         parts = {name: checkpoint.tensors[f"gaussians.{name}"] for name in PARAMETERS}
-        self.model = Model.start(Gaussians(**parts))
+        self.model = OptimizedGaussians.start(Gaussians(**parts))
         self.step = int(checkpoint.meta["step"])
         scene: Scene = load_scene(self.config.data)
         targets = Targets(scene.train, torch.ones(3), 1 << 32)

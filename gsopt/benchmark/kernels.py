@@ -22,7 +22,7 @@ from gsopt.errors import UsageError
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.raster.cpu_backend import CpuBackend
-from gsopt.training.optimizer import Model, adam_step, learning_rates
+from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
 
 CASES = ("200x200/20k", "400x400/50k", "800x800/100k", "800x800/300k")
 CASE_PATTERN = re.compile(r"(\d+)x(\d+)/(\d+)(k|M|)")
@@ -72,7 +72,7 @@ class Iteration:
     def __init__(self, case: Case, threads: int) -> None:
         self.backend = CpuBackend(threads)
         gaussians, self.camera = surface_scene(case.count, case.width, case.height)
-        self.model = Model.start(gaussians)
+        self.model = OptimizedGaussians.start(gaussians)
         self.settings = RasterSettings()
         self.config = OptimizerConfig()
         # Rates so small that the scene does not change between the first and the last repetition.

@@ -238,7 +238,7 @@ class ScheduleConfig:
     stop_when_flat: bool = False
     """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
     crop_masked: bool = False
-    """Draw only where a masked image shows something, the whole image every 8th step (training/window.py)."""
+    """Draw only where a masked image shows something, the whole image every 8th step (training/content_window.py)."""
     rest_converged: bool = False
     """After the last refinement, leave out every other visit of a view whose loss no longer falls."""
     bands: Literal["steps", "residual"] = "steps"

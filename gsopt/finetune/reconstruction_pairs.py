@@ -33,7 +33,7 @@ from gsopt.sds.priors.protocol import References
 from gsopt.sds.priors.view_conditioned import WARPED
 from gsopt.sds.warp import warp
 from gsopt.training import schedule
-from gsopt.training.mirrors import with_mirrors
+from gsopt.training.mirror_images import with_mirrors
 from gsopt.training.trainer import Trainer
 
 INPUTS = (3, 4, 4, 5, 6, 8)

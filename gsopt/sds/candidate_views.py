@@ -32,7 +32,7 @@ FRONT = math.radians(45)
 
 
 @dataclass(frozen=True)
-class Rig:
+class GuidanceCameras:
     """Where the subject is and how the input cameras stand around it."""
 
     focus: Float[Tensor, "3"]
@@ -84,7 +84,7 @@ class Rig:
         )
 
 
-def make_rig(inputs: Sequence[Cameras], extent: float, size: int, front: Cameras) -> Rig:
+def guidance_cameras(inputs: Sequence[Cameras], extent: float, size: int, front: Cameras) -> GuidanceCameras:
     """Rings of cameras around the subject; between the inputs where their axes do not meet."""
     focus = find_focus(list(inputs), extent)
     same = Cameras.cat([square(camera, size) for camera in inputs])
@@ -94,12 +94,12 @@ def make_rig(inputs: Sequence[Cameras], extent: float, size: int, front: Cameras
     lengths = centers.norm(dim=1)
     half = min(min(c.width / float(c.Ks[0, 0, 0]), c.height / float(c.Ks[0, 1, 1])) / 2 for c in inputs)
     K = intrinsics(2 * math.atan(half), size, size)
-    rig = Rig(focus.point.double(), up, ahead, float(lengths.median()), K, size, same, None)
+    cameras = GuidanceCameras(focus.point.double(), up, ahead, float(lengths.median()), K, size, same, None)
     if not focus.converging:
-        return replace(rig, candidates=interpolated_path(same, FORWARD_FACING).to(torch.float32))
+        return replace(cameras, candidates=interpolated_path(same, FORWARD_FACING).to(torch.float32))
     mean = float(torch.asin((centers @ up / lengths.clamp_min(1e-12)).clamp(-1, 1)).mean())
     angles = ring_angles(mean)
-    return replace(rig, candidates=rig.placed(angles), angles=angles)
+    return replace(cameras, candidates=cameras.placed(angles), angles=angles)
 
 
 def ring_angles(mean_elevation: float) -> Float[Tensor, "C 2"]:

@@ -24,9 +24,9 @@ from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, RasterSettings
 
-MOST_VIEWS = 32
+MAX_VIEWS = 32
 """Input views that are looked through, the farthest apart: coverage saturates long before."""
-SIDE = 128
+DEPTH_MAP_SIDE = 128
 """Longer side of the depth maps, px."""
 DEPTH_SLACK = 0.02
 """Share of the depth by which a centre may lie behind the surface and still count as visible."""
@@ -40,7 +40,7 @@ PLAIN = RasterSettings(sh_degree=0)
 
 
 def coverage(gaussians: Gaussians, inputs: Sequence[Cameras], backend: Backend) -> Float[Tensor, "N"]:
-    """How many input views see each Gaussian; at most MOST_VIEWS."""
+    """How many input views see each Gaussian; at most MAX_VIEWS."""
     total = torch.zeros(len(gaussians))
     for camera in spread(inputs):
         total += seen(gaussians, _small(camera), backend)
@@ -103,15 +103,13 @@ def _painted(gaussians: Gaussians, u: Float[Tensor, "N"]) -> Gaussians:
 
 
 def spread(inputs: Sequence[Cameras]) -> list[Cameras]:
-    """At most MOST_VIEWS of the cameras."""
-    if len(inputs) <= MOST_VIEWS:
+    """At most MAX_VIEWS of the cameras."""
+    if len(inputs) <= MAX_VIEWS:
         return list(inputs)
-    return [
-        inputs[row] for row in sorted(farthest_points(torch.cat([camera.centers for camera in inputs]), MOST_VIEWS))
-    ]
+    return [inputs[row] for row in sorted(farthest_points(torch.cat([camera.centers for camera in inputs]), MAX_VIEWS))]
 
 
 def _small(camera: Cameras) -> Cameras:
-    scale = min(1.0, SIDE / max(camera.width, camera.height))
+    scale = min(1.0, DEPTH_MAP_SIDE / max(camera.width, camera.height))
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     return small.to(torch.float32)

@@ -19,18 +19,18 @@ from gsopt.metrics import capped_psnr
 from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, Gradients, RasterSettings, RenderedFrame
 from gsopt.sds import coverage, policies, schedule
-from gsopt.sds.candidate_views import draw_candidate, make_rig, nearest, square_views
+from gsopt.sds.candidate_views import draw_candidate, guidance_cameras, nearest, square_views
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.noise import Latents, generator
 from gsopt.sds.priors.protocol import Condition, Images, Pair, Prior, References, Scale
 
 COVERAGE_EVERY = 100
 """Steps after which coverage is taken anew even if no Gaussian came or went."""
-MOST_FAILURES = 3
+MAX_FAILURES = 3
 """Failed calls in a row after which the run goes on without guidance."""
 SMALLEST = 0.05
 """Share of the picture below which a subject counts as filling this much."""
-MOST_PSNR = 60.0
+MAX_PSNR = 60.0
 """dB; from there on images are the same."""
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
 
@@ -66,7 +66,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ObservedRender:
     """A render that is to be judged, and what is known about it."""
 
     camera: Cameras
@@ -118,7 +118,7 @@ class Guide:
         self.weight, self.iterations, self.seed, self.background = weight, iterations, seed, background
         self.warn = warn
         self.inputs = [view.camera for view in scene.drawn]
-        self.rig = make_rig(self.inputs, scene.extent, prior.size, front)
+        self.cameras = guidance_cameras(self.inputs, scene.extent, prior.size, front)
         self.references = square_views(scene.train, prior.size, torch.ones(3) if background is None else background)
         self.counts = Counts()
         self.memory = Memory()
@@ -164,17 +164,17 @@ class Guide:
 
     def mean_uncertainty(self, gaussians: Gaussians, covered: Float[Tensor, "N"]) -> Float[Tensor, "C"]:
         """Of every candidate's view, at a low resolution."""
-        small = self.rig.candidates.resized(32, 32)
+        small = self.cameras.candidates.resized(32, 32)
         return coverage.mean_uncertainty(gaussians, coverage.uncertainty(covered), small, self.backend)
 
     def _guided(self, step: int, index: int, gaussians: Gaussians, settings: RasterSettings) -> Gradients:
         """Render, ask, and carry the answer back to the parameters."""
         # recon compares with a target of an earlier step: neither camera nor background may have changed since.
         still = self.config.policy == "recon"
-        camera = self.rig.camera(index, None if still else self._random(step, index, "jitter"))
+        camera = self.cameras.camera(index, None if still else self._random(step, index, "jitter"))
         background = self._background(index if still else step)
         frame, seen = self._see(camera, background, gaussians, settings)
-        v_images = self.weight * self.pull(step, index, seen)
+        v_images = self.weight * self.image_gradient(step, index, seen)
         if not bool(torch.isfinite(v_images).all()):
             raise NumericalError(
                 f"The gradient of the guidance in step {step} is not finite. Choose --guidance.dtype float32."
@@ -186,12 +186,12 @@ class Guide:
 
     def _see(
         self, camera: Cameras, background: Float[Tensor, "3"], gaussians: Gaussians, settings: RasterSettings
-    ) -> tuple[RenderedFrame, Seen]:
+    ) -> tuple[RenderedFrame, ObservedRender]:
         """A render, and what is known about it."""
         assert self.memory.coverage is not None
         frame = self.backend.forward(gaussians, camera, settings, background, depth=self.prior.aligned)
         u = coverage.uncertainty(self.memory.coverage)
-        return frame, Seen(
+        return frame, ObservedRender(
             camera=camera,
             images=frame.colors.detach().permute(2, 0, 1)[None],
             alphas=frame.alphas.detach(),
@@ -208,7 +208,7 @@ class Guide:
         _, seen = self._see(truth.cameras, background, gaussians, settings)
         answer = self._answer(step, 0, seen)
         before, after = (
-            capped_psnr(images.clamp(0, 1).permute(0, 2, 3, 1), truth.images.permute(0, 2, 3, 1), MOST_PSNR)
+            capped_psnr(images.clamp(0, 1).permute(0, 2, 3, 1), truth.images.permute(0, 2, 3, 1), MAX_PSNR)
             for images in (seen.images, answer)
         )
         return float(after - before)
@@ -221,7 +221,7 @@ class Guide:
         depths = [depth_in(gaussians, chosen.cameras[k], self.backend) for k in range(len(chosen.cameras))]
         return replace(chosen, depths=torch.stack(depths))
 
-    def pull(self, step: int, index: int, seen: Seen) -> Images:
+    def image_gradient(self, step: int, index: int, seen: ObservedRender) -> Images:
         """dL/d(images) of the policy's loss, lambda left out."""
         images, weights = seen.images, self._weights(seen)
         if self.config.policy == "recon":
@@ -229,26 +229,26 @@ class Guide:
             self._remember(step, index, "", seen, None, target[0])
             # A mean over the subject's pixels: how much of the picture it fills does not matter.
             weights = weights / seen.alphas.mean().clamp_min(SMALLEST)
-            return policies.pixel_pull(images, target, weights * policies.wanted(images, asked, target))
+            return policies.pixel_gradient(images, target, weights * policies.wanted(images, asked, target))
         with torch.enable_grad():
             leaf = images.clone().requires_grad_()
             z = self.prior.encode(leaf)
-        drawn, look = self._look(step, index, seen, z)
+        drawn, noise = self._noise_sample(step, index, seen, z)
         if self.config.policy == "sdi":
-            pull = policies.sdi(self.prior, z, look, self.config.inversion_steps)
+            pull = policies.sdi(self.prior, z, noise, self.config.inversion_steps)
         else:
-            pull = policies.sds(self.prior, z, look)
+            pull = policies.sds(self.prior, z, noise)
         self._remember(step, index, drawn, seen, pull.x0, None)
         # Divided by numel only after the encoder's backward pass: half precision would lose so small a gradient.
         (v_images,) = torch.autograd.grad(z, leaf, policies.resized(weights, z) * pull.g)
         return v_images / z.numel()
 
-    def _weights(self, seen: Seen) -> Float[Tensor, "S S"]:
+    def _weights(self, seen: ObservedRender) -> Float[Tensor, "S S"]:
         """Of every pixel: `certain_weight` where the inputs decide, 1 where they say nothing, 0 beside the subject."""
         certain = sure(self.config.certain_weight)
         return certain * seen.alphas + (1 - certain) * seen.uncertainty
 
-    def _target(self, step: int, index: int, seen: Seen) -> tuple[Images, Images]:
+    def _target(self, step: int, index: int, seen: ObservedRender) -> tuple[Images, Images]:
         """recon's target for a candidate and the render it was made of: made anew when it is too old, rounded to what
         a checkpoint keeps."""
         memory = self.memory
@@ -265,18 +265,20 @@ class Guide:
         return asked, target
 
     @torch.no_grad()
-    def _answer(self, step: int, index: int, seen: Seen) -> Images:
+    def _answer(self, step: int, index: int, seen: ObservedRender) -> Images:
         """The image that the prior thinks should be there."""
         z = self.prior.encode(seen.images)
-        _, look = self._look(step, index, seen, z)
-        return self.prior.decode(policies.denoised(self.prior, z, look, sure(self.config.denoise_steps)))
+        _, noise = self._noise_sample(step, index, seen, z)
+        return self.prior.decode(policies.denoised(self.prior, z, noise, sure(self.config.denoise_steps)))
 
-    def _look(self, step: int, index: int, seen: Seen, z: Latents) -> tuple[str, policies.Look]:
+    def _noise_sample(
+        self, step: int, index: int, seen: ObservedRender, z: Latents
+    ) -> tuple[str, policies.NoiseSample]:
         """This step's noise level, noise and conditions, and the text among the latter."""
         random = self._random(step, index, "noise")
         least, most = schedule.noise_range(step, self.config, self.iterations)
         share = least + (most - least) * float(torch.rand(1, generator=random, dtype=torch.float64))
-        side = self.rig.side(seen.camera, self._front_known())
+        side = self.cameras.side(seen.camera, self._front_known())
         drawn = self.conditioning.draw(side, self._random(step, index, "prompt"))
         positive = Condition(
             tokens=drawn.positive,
@@ -288,7 +290,7 @@ class Guide:
             references=seen.references,
         )
         negative = replace(positive, tokens=drawn.negative, class_embedding=None, references=None)
-        return drawn.text, policies.Look(
+        return drawn.text, policies.NoiseSample(
             t=self.prior.schedule.step(share),
             eps=torch.randn(z.shape, generator=random).to(z),
             pair=Pair(positive, negative),
@@ -315,8 +317,8 @@ class Guide:
         counts = self.counts
         counts.failed += 1
         counts.failed_in_a_row += 1
-        counts.ended = counts.failed_in_a_row >= MOST_FAILURES
-        end = f" That was failure {MOST_FAILURES} in a row: the run goes on without guidance." if counts.ended else ""
+        counts.ended = counts.failed_in_a_row >= MAX_FAILURES
+        end = f" That was failure {MAX_FAILURES} in a row: the run goes on without guidance." if counts.ended else ""
         self.warn(f"Step {step} is not guided: {error}{end}")
 
     def _remember(
@@ -324,7 +326,7 @@ class Guide:
         step: int,
         index: int,
         text: str,
-        seen: Seen,
+        seen: ObservedRender,
         x0: Latents | None,
         target: Float[Tensor, "3 S S"] | None,
     ) -> None:

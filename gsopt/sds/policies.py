@@ -10,13 +10,13 @@ the resolution. g depends on the policy:
 
 recon compares pixels instead, by the distance that most of the photometric loss is (Zhou & Tulsiani 2023):
 
-    (2)  L = mean( u sqrt((x - y)^2 + e^2) ),   y denoised from z_t, e = ROUND
+    (2)  L = mean( u sqrt((x - y)^2 + e^2) ),   y denoised from z_t, e = ROUNDING
 
 y is kept for some hundred steps, in which the render goes on from the x' it was made of. What the prior wanted is
 y - x', so u is multiplied by how much that is, and by 0 where the render has passed y by itself: else an old target,
 which is mostly an old render, would hold the reconstruction back.
 
-    (3)  u' = u c^2 / (c^2 + SURE^2) [c (y - x) > 0],   c = y - x'
+    (3)  u' = u c^2 / (c^2 + CHANGE_SCALE^2) [c (y - x) > 0],   c = y - x'
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from torch import Tensor
 from gsopt.sds.noise import Latents, Signal, add_noise, eps_from, weight
 from gsopt.sds.priors.protocol import Images, Pair, Prior, Scale, guided_x0
 
-ROUND = 0.01
+ROUNDING = 0.01
 """Differences well below this count by their square: no gradient jumps where the render has arrived."""
 
-SURE = 0.05
+CHANGE_SCALE = 0.05
 """Changes well below this are not what a prior wants, but what it cannot know better."""
 
 
 @dataclass(frozen=True)
-class Look:
+class NoiseSample:
     """How one guided step looks at its render: its random numbers, and the settings that matter to it."""
 
     t: int
@@ -51,7 +51,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Pull:
+class GuidanceGradient:
     """Where the prior wants the render to go."""
 
     g: Latents
@@ -60,50 +60,50 @@ class Pull:
     """The prior's estimate of the clean image."""
 
 
-def sds(prior: Prior, z: Latents, look: Look) -> Pull:
+def sds(prior: Prior, z: Latents, noise: NoiseSample) -> GuidanceGradient:
     """Score distillation from one noisy copy of `z`."""
     z = z.detach()
-    return _distilled(prior, z, add_noise(z, look.eps, _signal(prior, look.t, z)), look)
+    return _distilled(prior, z, add_noise(z, noise.eps, _signal(prior, noise.t, z)), noise)
 
 
-def sdi(prior: Prior, z: Latents, look: Look, steps: int) -> Pull:
+def sdi(prior: Prior, z: Latents, noise: NoiseSample, steps: int) -> GuidanceGradient:
     """Score distillation whose noise belongs to `z`: nothing random but t, less variance, `steps` more calls."""
     z = z.detach()
-    return _distilled(prior, z, inverted(prior, z, look, steps), look)
+    return _distilled(prior, z, inverted(prior, z, noise, steps), noise)
 
 
-def _distilled(prior: Prior, z: Latents, x_t: Latents, look: Look) -> Pull:
+def _distilled(prior: Prior, z: Latents, x_t: Latents, noise: NoiseSample) -> GuidanceGradient:
     """g from the noisy copy; x_t fixes the noise, so eps_hat - eps = sqrt(a/(1-a)) (z - x0_hat)."""
-    signal = _signal(prior, look.t, z)
-    x0 = guided_x0(prior, x_t, look.t, look.pair, look.scale)
-    g = weight(look.weighting, signal) * (signal / (1 - signal)).sqrt() * (z - x0)
-    return Pull(clipped(g, look.clip_rms), x0)
+    signal = _signal(prior, noise.t, z)
+    x0 = guided_x0(prior, x_t, noise.t, noise.pair, noise.scale)
+    g = weight(noise.weighting, signal) * (signal / (1 - signal)).sqrt() * (z - x0)
+    return GuidanceGradient(clipped(g, noise.clip_rms), x0)
 
 
 @torch.no_grad()
-def inverted(prior: Prior, z: Latents, look: Look, steps: int) -> Latents:
+def inverted(prior: Prior, z: Latents, noise: NoiseSample, steps: int) -> Latents:
     """x_t that deterministic DDIM (Song et al. 2021, eq. 12) would bring back to `z`: its steps taken backwards.
 
     The noise between s and t > s is asked for at t, where the network is better conditioned. Unconditional, as the
     inversion of ISM (Liang et al. 2024).
     """
-    plain = Scale(0.0, 0.0, look.scale.sequential)
+    plain = Scale(0.0, 0.0, noise.scale.sequential)
     x, here = z, torch.ones_like(_signal(prior, 0, z))
-    for t in times(look.t, steps)[::-1]:
+    for t in times(noise.t, steps)[::-1]:
         there = _signal(prior, t, z)
-        eps = eps_from(guided_x0(prior, x, t, look.pair, plain), x, there)
+        eps = eps_from(guided_x0(prior, x, t, noise.pair, plain), x, there)
         x0 = (x - (1 - here).sqrt() * eps) / here.sqrt()
         x, here = add_noise(x0, eps, there), there
     return x
 
 
 @torch.no_grad()
-def denoised(prior: Prior, z: Latents, look: Look, steps: int) -> Latents:
+def denoised(prior: Prior, z: Latents, noise: NoiseSample, steps: int) -> Latents:
     """`z` noised to t and brought back by `steps` DDIM steps (SDEdit, Meng et al. 2022)."""
-    x = add_noise(z.detach(), look.eps, _signal(prior, look.t, z))
-    descending = times(look.t, steps)
+    x = add_noise(z.detach(), noise.eps, _signal(prior, noise.t, z))
+    descending = times(noise.t, steps)
     for t, after in zip(descending, [*descending[1:], None], strict=True):
-        x0 = guided_x0(prior, x, t, look.pair, look.scale)
+        x0 = guided_x0(prior, x, t, noise.pair, noise.scale)
         if after is None:
             break
         x = add_noise(x0, eps_from(x0, x, _signal(prior, t, z)), _signal(prior, after, z))
@@ -124,14 +124,14 @@ def loss(z: Latents, g: Latents, weights: Float[Tensor, "B 1 h w"]) -> Float[Ten
 def wanted(images: Images, asked: Images, target: Images) -> Images:
     """Equation (3) without u; `asked` is the render that `target` was made of."""
     change = target - asked
-    share = change.square() / (change.square() + SURE**2)
+    share = change.square() / (change.square() + CHANGE_SCALE**2)
     return share * (change * (target - images.detach()) > 0)
 
 
-def pixel_pull(images: Images, target: Images, weights: Images | Float[Tensor, "S S"]) -> Images:
+def pixel_gradient(images: Images, target: Images, weights: Images | Float[Tensor, "S S"]) -> Images:
     """dL/dx of equation (2)."""
     apart = images.detach() - target
-    return weights * apart / (apart.square() + ROUND**2).sqrt() / apart.numel()
+    return weights * apart / (apart.square() + ROUNDING**2).sqrt() / apart.numel()
 
 
 def resized(weights: Float[Tensor, "S S"], z: Latents) -> Float[Tensor, "1 1 h w"]:

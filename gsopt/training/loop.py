@@ -27,13 +27,13 @@ from gsopt.training.finite import require_finite, require_finite_loss
 from gsopt.training.guided.session import RunGuidance
 from gsopt.training.guided.start import start_guidance
 from gsopt.training.interrupt import StopRequest
-from gsopt.training.mirrors import with_recorded_mirrors
+from gsopt.training.mirror_images import with_recorded_mirrors
 from gsopt.training.run_directory import Listener, RunDirectory, opened
 from gsopt.training.trainer import Trainer
 
 PROGRESS_SECONDS = 0.5
 # Every parameter is looked at this often; the loss is looked at in every step.
-GUARD_EVERY = 100
+FINITE_EVERY = 100
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock
             return True
         loss, view = trainer.advance()
         require_finite_loss(loss, view, trainer.step, _last_good(directory))
-        if trainer.step % GUARD_EVERY == 0:
+        if trainer.step % FINITE_EVERY == 0:
             _guard(trainer, directory)
         if is_due(trainer.step, config.checkpoint_every):
             _save(trainer, directory, clock)

@@ -14,7 +14,7 @@ from gsopt.raster.backend import AdamStep, Backend, Gradients, RasterSettings
 
 
 @dataclass(frozen=True)
-class Model:
+class OptimizedGaussians:
     """N Gaussians and Adam's two moments of every parameter: rows stay together. Tensors are updated in place."""
 
     gaussians: Gaussians
@@ -26,15 +26,15 @@ class Model:
     """Adam steps taken per parameter; shN takes none while only band 0 is drawn."""
 
     @staticmethod
-    def start(gaussians: Gaussians) -> Model:
+    def start(gaussians: Gaussians) -> OptimizedGaussians:
         """Fresh moments; the parameters are copied, so the caller's record is left alone."""
         owned = Gaussians(**{name: tensor.detach().clone().contiguous() for name, tensor in gaussians.items()})
-        return Model(owned, zeros_like(owned), zeros_like(owned), dict.fromkeys(PARAMETERS, 0))
+        return OptimizedGaussians(owned, zeros_like(owned), zeros_like(owned), dict.fromkeys(PARAMETERS, 0))
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
-    def select(self, rows: Tensor) -> Model:
+    def select(self, rows: Tensor) -> OptimizedGaussians:
         """The rows named by a boolean mask or by indices, moments included."""
         return replace(
             self,
@@ -43,7 +43,7 @@ class Model:
             exp_avg_sq=self.exp_avg_sq.select(rows),
         )
 
-    def append(self, new: Gaussians) -> Model:
+    def append(self, new: Gaussians) -> OptimizedGaussians:
         """These rows, then new ones without a past: their moments are zero."""
         return replace(
             self,
@@ -71,7 +71,7 @@ def learning_rates(config: OptimizerConfig, lr_means: float, share: float = 1.0)
 
 
 def adam_step(
-    model: Model,
+    model: OptimizedGaussians,
     gradients: Gradients,
     rates: dict[str, float],
     config: OptimizerConfig,

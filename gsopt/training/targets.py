@@ -12,7 +12,7 @@ from torch import Tensor
 from gsopt.data.resample import area_downscale, downscaled_size, premultiply
 from gsopt.data.scene import View
 from gsopt.geometry.cameras import Cameras
-from gsopt.training.window import content_window
+from gsopt.training.content_window import content_window
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,15 @@ from gsopt.geometry.morton import morton_order
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.training import schedule
 from gsopt.training.checkpoint import Checkpoint
+from gsopt.training.content_window import draws_whole
 from gsopt.training.density import at_least_one, make_density
 from gsopt.training.floaters import solitary
-from gsopt.training.optimizer import Model, adam_step, learning_rates
-from gsopt.training.order import ViewOrder, generators
+from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
 from gsopt.training.poses import PoseRefinement
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import Target, Targets, content_pixels
-from gsopt.training.window import draws_whole
+from gsopt.training.view_order import ViewOrder, generators
 
 if TYPE_CHECKING:
     from gsopt.training.guided.session import RunGuidance
@@ -94,7 +94,7 @@ class Trainer:
         self._extent = scene.extent
         self._coarse_until = schedule.coarse_until(config, views)
         self._budget = schedule.max_gaussians(config, content_pixels(scene.train))
-        self.model = Model.start(self._first(gaussians))
+        self.model = OptimizedGaussians.start(self._first(gaussians))
         bounded = replace(config, density=replace(config.density, max_gaussians=self._budget))
         self._density = make_density(bounded, self._extent, len(self.model), self._generators["density"])
 
@@ -304,7 +304,9 @@ class Trainer:
         """Inverse of `state`."""
         gaussians, exp_avg, exp_avg_sq = (_record(tensors, kind) for kind in RECORDS)
         _require_same_shapes(gaussians.validate(), exp_avg, exp_avg_sq)
-        self.model = Model(gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS})
+        self.model = OptimizedGaussians(
+            gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS}
+        )
         self._density.restore(_part(tensors, "density."))
         self._resting.restore(_part(tensors, "resting."))
         self._bands.restore(_part(tensors, "bands."))

@@ -27,7 +27,7 @@ from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.api import make_backend, rasterize
 from gsopt.raster.backend import TRANSMITTANCE_MIN, AdamStep, Backend, Gradients, RasterSettings
-from gsopt.training.optimizer import Model
+from gsopt.training.optimizer import OptimizedGaussians
 
 FULL = os.environ.get("GSOPT_STRESS") == "full"
 MANY = 5_000_000 if FULL else 100_000
@@ -154,7 +154,7 @@ def test_many_in_front_of_few_pixels(backend: Backend) -> None:
 @pytest.mark.parametrize("rate", [0.3, 10.0, 1e6, 1e30])
 def test_a_hostile_learning_rate_leaves_numbers(backend: Backend, rate: float) -> None:
     case = plain()
-    model = Model.start(case.gaussians.to(torch.float32))
+    model = OptimizedGaussians.start(case.gaussians.to(torch.float32))
     target = torch.rand(28, 40, 3, generator=torch.Generator().manual_seed(0))
     for step in range(1, STEPS + 1):
         frame = backend.forward(model.gaussians, case.camera, case.settings, case.background)

@@ -66,7 +66,7 @@ def step(prior: DiffusersPrior, images: torch.Tensor, meter: Meter, sequential: 
     with torch.enable_grad(), meter.phase("encode"):
         z = prior.encode(images)
     width = prior.folder.unet["cross_attention_dim"]
-    look = policies.Look(
+    look = policies.NoiseSample(
         t=500,
         eps=torch.randn(z.shape),
         pair=Pair(Condition(tokens=torch.rand(77, width)), Condition(tokens=torch.rand(77, width))),

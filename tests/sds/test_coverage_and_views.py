@@ -15,7 +15,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.raster.api import make_backend
 from gsopt.sds import coverage, schedule
-from gsopt.sds.candidate_views import AZIMUTHS, HIGHEST, LOWEST, draw_candidate, make_rig, nearest, square
+from gsopt.sds.candidate_views import AZIMUTHS, HIGHEST, LOWEST, draw_candidate, guidance_cameras, nearest, square
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.protocol import References
 
@@ -109,7 +109,7 @@ def test_coverage_does_not_depend_on_the_world_frame() -> None:
 
 def test_no_more_views_are_looked_through_than_matter() -> None:
     many = [camera(3.6 * i) for i in range(100)]
-    assert len(coverage.spread(many)) == coverage.MOST_VIEWS
+    assert len(coverage.spread(many)) == coverage.MAX_VIEWS
     assert coverage.spread(many[:5]) == many[:5]
 
 
@@ -117,21 +117,21 @@ INPUTS = [camera(0, 20), camera(40, 20), camera(80, 20), camera(-40, 20)]
 
 
 def test_candidates_stand_around_the_subject_and_look_at_it() -> None:
-    rig = make_rig(INPUTS, 2.0, 32, INPUTS[0])
-    assert len(rig.candidates) == 3 * AZIMUTHS
-    assert (rig.candidates.width, rig.candidates.height) == (32, 32)
-    torch.testing.assert_close(rig.candidates.centers.norm(dim=1), torch.full((36,), 4.0), rtol=0, atol=1e-2)
-    towards = torch.nn.functional.normalize(-rig.candidates.centers, dim=1)
-    assert float((towards * rig.candidates.forwards).sum(1).min()) > 0.999
-    elevations = torch.asin(rig.candidates.centers[:, 2] / 4)
+    cameras = guidance_cameras(INPUTS, 2.0, 32, INPUTS[0])
+    assert len(cameras.candidates) == 3 * AZIMUTHS
+    assert (cameras.candidates.width, cameras.candidates.height) == (32, 32)
+    torch.testing.assert_close(cameras.candidates.centers.norm(dim=1), torch.full((36,), 4.0), rtol=0, atol=1e-2)
+    towards = torch.nn.functional.normalize(-cameras.candidates.centers, dim=1)
+    assert float((towards * cameras.candidates.forwards).sum(1).min()) > 0.999
+    elevations = torch.asin(cameras.candidates.centers[:, 2] / 4)
     assert float(elevations.min()) >= LOWEST - 1e-3
     assert float(elevations.max()) <= HIGHEST + 1e-3
 
 
 def test_a_wide_image_gives_the_field_of_view_of_its_middle_square() -> None:
     wide = camera(0, 20, width=96, height=64)
-    rig = make_rig([wide, camera(40, 20, width=96, height=64)], 2.0, 32, wide)
-    assert float(rig.K[0, 0]) == pytest.approx(float(wide.Ks[0, 1, 1]) / 2)
+    cameras = guidance_cameras([wide, camera(40, 20, width=96, height=64)], 2.0, 32, wide)
+    assert float(cameras.K[0, 0]) == pytest.approx(float(wide.Ks[0, 1, 1]) / 2)
     cut = square(wide, 32)
     assert (cut.width, cut.height) == (32, 32)
     assert cut.Ks[0, :2, 2].tolist() == [16.0, 16.0]
@@ -142,11 +142,11 @@ def test_cameras_that_look_at_no_common_subject_are_interpolated() -> None:
     outward = torch.tensor([[-1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
     viewmats = torch.cat([look_at(eyes[i : i + 1], eyes[i] + outward[i], UP.float()) for i in range(3)])
     inputs = [Cameras(viewmats[i : i + 1], intrinsics(0.8, 64, 64)[None].float(), 64, 64) for i in range(3)]
-    rig = make_rig(inputs, 1.0, 32, inputs[0])
-    assert rig.angles is None
-    assert float(rig.candidates.centers[:, 0].min()) >= -1e-4
-    assert float(rig.candidates.centers[:, 0].max()) <= 2 + 1e-4
-    assert torch.equal(rig.camera(3, generator(0, 0, 0, "jitter")).viewmats, rig.candidates[3].viewmats)
+    cameras = guidance_cameras(inputs, 1.0, 32, inputs[0])
+    assert cameras.angles is None
+    assert float(cameras.candidates.centers[:, 0].min()) >= -1e-4
+    assert float(cameras.candidates.centers[:, 0].max()) <= 2 + 1e-4
+    assert torch.equal(cameras.camera(3, generator(0, 0, 0, "jitter")).viewmats, cameras.candidates[3].viewmats)
 
 
 @pytest.mark.parametrize(
@@ -162,17 +162,17 @@ def test_cameras_that_look_at_no_common_subject_are_interpolated() -> None:
     ],
 )
 def test_a_side_is_told_from_the_front_camera(azimuth: float, elevation: float, side: str) -> None:
-    rig = make_rig(INPUTS, 2.0, 32, camera(30, 20))
-    assert rig.side(camera(azimuth, elevation), front_known=True) == side
-    assert rig.side(camera(azimuth, elevation), front_known=False) == ("top" if side == "top" else "")
+    cameras = guidance_cameras(INPUTS, 2.0, 32, camera(30, 20))
+    assert cameras.side(camera(azimuth, elevation), front_known=True) == side
+    assert cameras.side(camera(azimuth, elevation), front_known=False) == ("top" if side == "top" else "")
 
 
 def test_a_drawn_candidate_is_moved_a_little_and_the_same_way_again() -> None:
-    rig = make_rig(INPUTS, 2.0, 32, INPUTS[0])
-    one, again, other = (rig.camera(5, generator(0, step, 5, "jitter")) for step in (1, 1, 2))
+    cameras = guidance_cameras(INPUTS, 2.0, 32, INPUTS[0])
+    one, again, other = (cameras.camera(5, generator(0, step, 5, "jitter")) for step in (1, 1, 2))
     assert torch.equal(one.viewmats, again.viewmats)
     assert not torch.equal(one.viewmats, other.viewmats)
-    angle = torch.acos((one.forwards[0] @ rig.candidates.forwards[5]).clamp(-1, 1))
+    angle = torch.acos((one.forwards[0] @ cameras.candidates.forwards[5]).clamp(-1, 1))
     assert 0 < float(angle) < math.radians(17)
 
 

@@ -90,7 +90,7 @@ def test_pipelines_of_one_model_that_predict_eps_v_and_x0_agree(sd21_copy: Path,
             return type("Output", (), {"sample": output})()
 
         other.__dict__["unet"] = unet
-        seen = policies.Look(500, eps, pair(), scale(3.0))
+        seen = policies.NoiseSample(500, eps, pair(), scale(3.0))
         found[kind] = policies.sds(other, z, seen).g
     torch.testing.assert_close(found["epsilon"], found["v_prediction"], rtol=0, atol=1e-4)
     torch.testing.assert_close(found["sample"], found["v_prediction"], rtol=0, atol=1e-4)
@@ -101,7 +101,7 @@ def test_no_gradient_reaches_any_network_and_one_reaches_the_image(sd21: Path) -
     images = torch.rand(1, 3, 64, 64).requires_grad_()
     with torch.enable_grad():
         z = prior.encode(images)
-        pull = policies.sds(prior, z, policies.Look(500, noise(1, 4, 8, 8), pair(), scale(3.0)))
+        pull = policies.sds(prior, z, policies.NoiseSample(500, noise(1, 4, 8, 8), pair(), scale(3.0)))
         policies.loss(z, pull.g, torch.ones(1, 1, 8, 8)).backward()
     assert not pull.g.requires_grad
     assert images.grad is not None

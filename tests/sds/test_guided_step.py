@@ -20,7 +20,7 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.sds import policies
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.guidance_step import MOST_FAILURES, Guide, Seen
+from gsopt.sds.guidance_step import MAX_FAILURES, Guide, ObservedRender
 
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)
@@ -90,7 +90,7 @@ def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
     assert found is not None
     sample = guided.sample
     assert sample is not None
-    camera = guided.rig.camera(sample.view, guided._random(7, sample.view, "jitter"))
+    camera = guided.cameras.camera(sample.view, guided._random(7, sample.view, "jitter"))
 
     def z_of(sh0: torch.Tensor) -> torch.Tensor:
         colors = BACKEND.forward(replace(gaussians, sh0=sh0), camera, SETTINGS, torch.ones(3)).colors
@@ -98,10 +98,10 @@ def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
 
     z, alphas = z_of(gaussians.sh0), BACKEND.forward(gaussians, camera, SETTINGS, torch.ones(3)).alphas
     assert sample.x0 is not None
-    seen = Seen(camera, (z.float() + 1) / 2, alphas, sample.uncertainty)
-    _, look = guided._look(7, sample.view, seen, z.float())
+    seen = ObservedRender(camera, (z.float() + 1) / 2, alphas, sample.uncertainty)
+    _, noise = guided._noise_sample(7, sample.view, seen, z.float())
     weights = (0.25 * alphas + 0.75 * sample.uncertainty).double()
-    g = policies.sds(guided.prior, z.float(), look).g.double()
+    g = policies.sds(guided.prior, z.float(), noise).g.double()
     direction, h = torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(1)), 1e-3
     ahead, behind = (
         0.2 * float(0.5 * (weights * (z_of(gaussians.sh0 + s * h * direction) - (z - g)).square()).mean())
@@ -152,8 +152,8 @@ def test_empty_surroundings_do_not_weaken_a_target() -> None:
         side = SIZE + 2 * border
         asked, target = torch.full((3, side, side), 255), torch.zeros(3, side, side)
         guided.memory.targets[0], guided.memory.target_steps[0] = torch.stack([asked, target]).to(torch.uint8), 1
-        seen = Seen(guided.rig.camera(0), torch.ones(1, 3, side, side), known, free)
-        pulls.append(guided.pull(1, 0, seen)[0, 0, border : side - border, border : side - border])
+        seen = ObservedRender(guided.cameras.camera(0), torch.ones(1, 3, side, side), known, free)
+        pulls.append(guided.image_gradient(1, 0, seen)[0, 0, border : side - border, border : side - border])
     torch.testing.assert_close(pulls[1], pulls[0])
     each = 1 / (3 * 8 * 8)  # dL/dx of a channel of one of the subject's pixels, where nothing is known
     assert float(pulls[0][5, 5]) == pytest.approx(0.25 * each, rel=5e-3)
@@ -231,7 +231,7 @@ def test_uncertain_views_are_drawn_more_often() -> None:
     for step in range(1, 61):
         assert guided.gradients(step, gaussians, SETTINGS) is not None
         assert guided.sample is not None
-        behind += bool(guided.rig.candidates.centers[guided.sample.view, 0] < 0)
+        behind += bool(guided.cameras.candidates.centers[guided.sample.view, 0] < 0)
     assert behind > 30  # more than half
 
 
@@ -249,7 +249,7 @@ def test_the_prior_is_told_everything_about_the_view() -> None:
     assert positive.render is not None
     assert positive.render.shape == (4, SIZE, SIZE)
     torch.testing.assert_close(positive.render[:3], sample.render.clamp(0, 1))
-    camera = guided.rig.camera(sample.view, guided._random(4, sample.view, "jitter"))
+    camera = guided.cameras.camera(sample.view, guided._random(4, sample.view, "jitter"))
     assert positive.camera is not None
     assert torch.equal(positive.camera.viewmats, camera.viewmats)
     assert positive.references is not None
@@ -275,7 +275,7 @@ def test_a_view_conditioned_prior_can_use_its_references() -> None:
     assert guided.gradients(4, blobs(), SETTINGS) is not None
     assert guided.sample is not None
     assert guided.sample.x0 is not None
-    camera = guided.rig.camera(guided.sample.view, guided._random(4, guided.sample.view, "jitter"))
+    camera = guided.cameras.camera(guided.sample.view, guided._random(4, guided.sample.view, "jitter"))
     closest = int((guided.references.cameras.forwards @ camera.forwards[0]).argmax())
     assert len({float(image.mean()) for image in guided.references.images}) == 3
     torch.testing.assert_close(guided.sample.x0[0], 2 * guided.references.images[closest] - 1)
@@ -309,8 +309,8 @@ def test_a_prior_that_fails_costs_the_step_then_the_guidance_never_the_run(polic
     prior = PixelPrior(lambda x_t, a, c: torch.full_like(x_t, math.nan), size=SIZE, name="broken")
     guided = guide(prior, replace(ALWAYS, policy=policy), warn=told.append)
     assert [guided.gradients(step, blobs(), SETTINGS) for step in range(1, 9)] == [None] * 8
-    assert (guided.counts.failed, guided.counts.ended) == (MOST_FAILURES, True)
-    assert len(told) == MOST_FAILURES
+    assert (guided.counts.failed, guided.counts.ended) == (MAX_FAILURES, True)
+    assert len(told) == MAX_FAILURES
     assert "broken" in told[0]
     assert "without guidance" in told[-1]
 

@@ -12,7 +12,7 @@ from gsopt.config.guidance import GuidanceConfig, settled
 from gsopt.errors import InputError, NumericalError
 from gsopt.sds import policies
 from gsopt.sds.noise import PREDICTIONS, NoiseSchedule, add_noise, eps_from, generator, output_for, weight, x0_from
-from gsopt.sds.policies import Look
+from gsopt.sds.policies import NoiseSample
 from gsopt.sds.priors.protocol import Condition, Pair, guided_x0
 
 WEIGHTINGS = ("sigma2", "fantasia", "one", "x0")
@@ -22,9 +22,9 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def look(t: int = 400, seed: int = 5, **changes: object) -> Look:
+def look(t: int = 400, seed: int = 5, **changes: object) -> NoiseSample:
     settings: dict[str, object] = {"pair": NOBODY, "scale": scale(), **changes}
-    return Look(t=t, eps=normal(1, 3, 8, 8, seed=seed), **settings)  # type: ignore[arg-type]
+    return NoiseSample(t=t, eps=normal(1, 3, 8, 8, seed=seed), **settings)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", WEIGHTINGS)
@@ -51,7 +51,7 @@ def test_lambda_does_not_depend_on_the_resolution() -> None:
     moved = []
     for image in (z, z.repeat_interleave(2, 2).repeat_interleave(2, 3)):
         leaf = image.clone().requires_grad_()
-        pull = policies.sds(prior, leaf, Look(400, torch.zeros_like(image), NOBODY, scale()))
+        pull = policies.sds(prior, leaf, NoiseSample(400, torch.zeros_like(image), NOBODY, scale()))
         policies.loss(leaf, pull.g, torch.ones(1, 1, *image.shape[2:])).backward()
         assert leaf.grad is not None
         moved.append(torch.nn.functional.adaptive_avg_pool2d(leaf.grad, 4) * leaf.grad[0, 0].numel() / 16)
@@ -82,7 +82,7 @@ def test_an_analytic_gaussian_prior_pulls_to_its_mean() -> None:
     signal = prior.schedule.signal(torch.tensor([t]), z)
     draws = [policies.sds(prior, z, look(t, seed=seed, weighting="one")).g for seed in range(200)]
     antithetic = [
-        policies.sds(prior, z, Look(t, -look(t, seed=seed).eps, NOBODY, scale(), "one")).g for seed in range(200)
+        policies.sds(prior, z, NoiseSample(t, -look(t, seed=seed).eps, NOBODY, scale(), "one")).g for seed in range(200)
     ]
     found = (sum(draws) + sum(antithetic)) / 400
     expected = (signal * (1 - signal)).sqrt() / (signal * std**2 + 1 - signal) * (z - mean)
@@ -97,8 +97,8 @@ def test_gradient_descent_on_an_analytic_gaussian_prior_ends_at_its_mean() -> No
         eps = torch.randn(z.shape, generator=random, dtype=z.dtype)
         t = int(torch.randint(20, 700, (1,), generator=random))
         z = z - 0.1 * (
-            policies.sds(prior, z, Look(t, eps, NOBODY, scale())).g
-            + policies.sds(prior, z, Look(t, -eps, NOBODY, scale())).g
+            policies.sds(prior, z, NoiseSample(t, eps, NOBODY, scale())).g
+            + policies.sds(prior, z, NoiseSample(t, -eps, NOBODY, scale())).g
         )
     torch.testing.assert_close(z, torch.full_like(z, 0.3), rtol=0, atol=1e-3)
 
@@ -126,10 +126,10 @@ def test_denoising_in_many_steps_reaches_the_posterior_of_the_flow() -> None:
     mean, std = 0.3, 0.5
     prior = PixelPrior(gaussian_posterior(mean, std))
     z = mean + std * normal(1, 3, 64, 64)
-    target = policies.denoised(prior, z, Look(900, normal(1, 3, 64, 64, seed=9), NOBODY, scale()), 300)
+    target = policies.denoised(prior, z, NoiseSample(900, normal(1, 3, 64, 64, seed=9), NOBODY, scale()), 300)
     assert float(target.mean()) == pytest.approx(mean, abs=0.02)
     assert float(target.std()) == pytest.approx(std, abs=0.02)
-    once = policies.denoised(prior, z, Look(900, normal(1, 3, 64, 64, seed=9), NOBODY, scale()), 1)
+    once = policies.denoised(prior, z, NoiseSample(900, normal(1, 3, 64, 64, seed=9), NOBODY, scale()), 1)
     assert float(once.std()) < 0.2  # one step answers the mean of all that could be
 
 
@@ -149,7 +149,7 @@ def test_models_that_predict_eps_v_and_x0_agree(t: int) -> None:
     found = {}
     for kind in PREDICTIONS:
         prior = PixelPrior(gaussian_posterior(0.3, 0.5), prediction=kind)
-        seen = Look(t, normal(1, 3, 8, 8, seed=3).float(), NOBODY, scale())
+        seen = NoiseSample(t, normal(1, 3, 8, 8, seed=3).float(), NOBODY, scale())
         found[kind] = policies.sds(prior, z, seen).g
     torch.testing.assert_close(found["epsilon"], found["sample"], rtol=0, atol=1e-4)
     torch.testing.assert_close(found["v_prediction"], found["sample"], rtol=0, atol=1e-4)
@@ -259,8 +259,8 @@ def test_the_pull_of_recon_is_the_gradient_of_its_loss() -> None:
     weights = torch.rand(5, 5, dtype=torch.float64, generator=generator)
     weights[0] = 0
     leaf = images.clone().requires_grad_()
-    (weights * ((leaf - target).square() + policies.ROUND**2).sqrt()).mean().backward()
-    found = policies.pixel_pull(images, target, weights)
+    (weights * ((leaf - target).square() + policies.ROUNDING**2).sqrt()).mean().backward()
+    found = policies.pixel_gradient(images, target, weights)
     torch.testing.assert_close(found, leaf.grad, rtol=1e-12, atol=0)
     assert float(found[..., 0, :].abs().max()) == float(found[..., 0].abs().max()) == 0
 
@@ -268,7 +268,7 @@ def test_the_pull_of_recon_is_the_gradient_of_its_loss() -> None:
 def test_an_old_target_pulls_only_where_and_as_far_as_the_prior_wanted() -> None:
     """Per value: no change was wanted; a large one is under way; it has been passed; a slight one."""
     asked = torch.tensor([0.5, 0.5, 0.5, 0.5]).view(1, 1, 2, 2)
-    target = torch.tensor([0.5, 0.9, 0.9, 0.5 + policies.SURE]).view(1, 1, 2, 2)
+    target = torch.tensor([0.5, 0.9, 0.9, 0.5 + policies.CHANGE_SCALE]).view(1, 1, 2, 2)
     images = torch.tensor([0.7, 0.6, 0.95, 0.5]).view(1, 1, 2, 2)
     found = policies.wanted(images, asked, target).flatten()
     assert found[0] == found[2] == 0

@@ -14,14 +14,14 @@ from gsopt.gaussians import Gaussians
 from gsopt.raster.backend import Gradients
 from gsopt.training.density import at_least_one
 from gsopt.training.density.adc import SPLIT_SHRINK, Adc, best, split
-from gsopt.training.optimizer import Model
+from gsopt.training.optimizer import OptimizedGaussians
 
 EXTENT = 2.0
 CONFIG = DensityConfig(refine_start=0, refine_every=10, refine_stop=100, grow_grad2d=1e-3, reset_every=50)
 ITERATIONS = 10_000
 
 
-def controlled(model: Model, config: DensityConfig = CONFIG) -> Adc:
+def controlled(model: OptimizedGaussians, config: DensityConfig = CONFIG) -> Adc:
     return Adc(config, ITERATIONS, EXTENT, len(model), torch.Generator().manual_seed(0))
 
 
@@ -54,7 +54,7 @@ SMALL, LARGE = 0.5 * CONFIG.grow_scale3d * EXTENT, 2 * CONFIG.grow_scale3d * EXT
 
 
 def test_statistics_are_the_mean_norm_in_normalised_device_coordinates() -> None:
-    model = Model.start(cloud(3, seed=1))
+    model = OptimizedGaussians.start(cloud(3, seed=1))
     density = controlled(model)
     radii = torch.tensor([[2, 2], [3, 3], [0, 0]], dtype=torch.int32)
     v = torch.tensor([[3.0, 0.0], [0.5, 1.0], [0.0, 0.0]])
@@ -67,7 +67,7 @@ def test_statistics_are_the_mean_norm_in_normalised_device_coordinates() -> None
 
 
 def test_the_absolute_gradient_is_used_when_there_is_one() -> None:
-    model = Model.start(cloud(4, seed=1))
+    model = OptimizedGaussians.start(cloud(4, seed=1))
     density = controlled(model)
     density.after_backward(1, pulled(4, torch.tensor([2]), absolute=True), seen(4), 10, 10)
     assert density.grad_sum.nonzero().flatten().tolist() == [2]
@@ -75,7 +75,7 @@ def test_the_absolute_gradient_is_used_when_there_is_one() -> None:
 
 def test_small_ones_are_cloned_large_ones_split_and_the_rest_stay() -> None:
     gaussians = scene([SMALL, LARGE, SMALL, LARGE], [0.5] * 4)
-    model = Model.start(gaussians)
+    model = OptimizedGaussians.start(gaussians)
     model.exp_avg.means.fill_(7.0)
     density = controlled(model)
     density.after_backward(5, pulled(4, torch.tensor([0, 1])), seen(4), 10, 10)
@@ -93,7 +93,7 @@ def test_small_ones_are_cloned_large_ones_split_and_the_rest_stay() -> None:
 
 
 def test_below_the_threshold_nothing_grows() -> None:
-    model = Model.start(scene([SMALL, LARGE], [0.5, 0.5]))
+    model = OptimizedGaussians.start(scene([SMALL, LARGE], [0.5, 0.5]))
     density = controlled(model)
     density.after_backward(5, pulled(2, torch.tensor([0, 1]), strength=0.9e-3 / 5), seen(2), 10, 10)
     assert len(density.refine(10, model)) == 2
@@ -102,7 +102,7 @@ def test_below_the_threshold_nothing_grows() -> None:
 @pytest.mark.parametrize("budget", [10, 13, 17, 20, 25])
 def test_the_budget_is_exact_and_goes_to_the_highest_scores(budget: int) -> None:
     config = DensityConfig(**{**CONFIG.__dict__, "max_gaussians": budget})
-    model = Model.start(scene([SMALL] * 10, [0.5] * 10))
+    model = OptimizedGaussians.start(scene([SMALL] * 10, [0.5] * 10))
     density = controlled(model, config)
     gradients = pulled(10, torch.arange(10))
     gradients.means2d[:, 0] = torch.arange(1.0, 11.0).flip(0)
@@ -132,13 +132,13 @@ def test_halves_are_drawn_from_the_gaussian_they_replace() -> None:
 def test_the_transparent_go_and_the_huge_go_once_opacities_were_reset() -> None:
     huge = 2 * CONFIG.prune_scale3d * EXTENT
     gaussians = scene([SMALL, SMALL, huge], [0.5, 0.5 * CONFIG.prune_opacity, 0.5])
-    early, late = Model.start(gaussians), Model.start(gaussians)
+    early, late = OptimizedGaussians.start(gaussians), OptimizedGaussians.start(gaussians)
     assert torch.equal(controlled(early).refine(10, early).gaussians.means, gaussians.means[[0, 2]])
     assert torch.equal(controlled(late).refine(60, late).gaussians.means, gaussians.means[[0]])
 
 
 def test_a_reset_caps_opacities_and_forgets_their_moments() -> None:
-    model = Model.start(scene([SMALL] * 3, [0.9, 0.5, 0.008]))
+    model = OptimizedGaussians.start(scene([SMALL] * 3, [0.9, 0.5, 0.008]))
     for moments in (model.exp_avg, model.exp_avg_sq):
         moments.logit_opacities.fill_(1.0)
         moments.means.fill_(1.0)
@@ -150,20 +150,20 @@ def test_a_reset_caps_opacities_and_forgets_their_moments() -> None:
 
 
 def test_between_refinements_the_record_is_the_very_same() -> None:
-    model = Model.start(cloud(5, seed=1))
+    model = OptimizedGaussians.start(cloud(5, seed=1))
     density = controlled(model)
     assert all(density.refine(step, model) is model for step in (1, 9, 11, 101, 110))
 
 
 def test_something_is_always_left() -> None:
-    model = Model.start(scene([SMALL] * 3, [1e-4, 3e-4, 2e-4]))
+    model = OptimizedGaussians.start(scene([SMALL] * 3, [1e-4, 3e-4, 2e-4]))
     refined = controlled(model).refine(10, model)
     assert torch.equal(refined.gaussians.means, model.gaussians.means[[1]])
     assert len(at_least_one(torch.zeros(0, dtype=torch.bool), torch.zeros(0))) == 0
 
 
 def test_statistics_follow_rows_and_return_from_a_checkpoint() -> None:
-    model = Model.start(cloud(6, seed=1))
+    model = OptimizedGaussians.start(cloud(6, seed=1))
     density = controlled(model)
     density.after_backward(1, pulled(6, torch.tensor([1, 4]), 2.0), seen(6), 10, 10)
     rows = torch.tensor([4, 0, 5])

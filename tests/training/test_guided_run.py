@@ -202,7 +202,7 @@ def test_words_of_a_run_that_was_broken_off_do_not_guide_the_next_one(
     dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(start, "judge_guidance", lambda *rest: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(start, "evaluate_guidance", lambda *rest: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             train(config(dataset, prompt=("a cat",)), tmp_path / "run")
     train(config(dataset, prompt=("a dog",)), tmp_path / "run")

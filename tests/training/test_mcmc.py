@@ -14,7 +14,7 @@ from tiny_scenes import cloud
 from gsopt.config.train import DensityConfig
 from gsopt.raster.reference import covariances
 from gsopt.training.density.mcmc import Mcmc, draw, shared, spread
-from gsopt.training.optimizer import Model
+from gsopt.training.optimizer import OptimizedGaussians
 
 CONFIG = DensityConfig(strategy="mcmc", refine_start=0, refine_every=10, refine_stop=100, max_gaussians=60)
 
@@ -51,7 +51,7 @@ def test_the_dead_are_moved_onto_the_living_with_fresh_moments() -> None:
     gaussians = cloud(40, seed=1)
     dead = torch.arange(0, 40, 4)
     gaussians.logit_opacities[dead] = -9.0
-    model = Model.start(replace(gaussians, logit_opacities=gaussians.logit_opacities.clamp_min(-9.0)))
+    model = OptimizedGaussians.start(replace(gaussians, logit_opacities=gaussians.logit_opacities.clamp_min(-9.0)))
     model.exp_avg.means.fill_(1.0)
     config = replace(CONFIG, max_gaussians=40)
     refined = controlled(config).refine(10, model)
@@ -72,18 +72,18 @@ def test_the_dead_are_moved_onto_the_living_with_fresh_moments() -> None:
 
 @pytest.mark.parametrize(("count", "budget", "after"), [(40, 60, 42), (59, 60, 60), (60, 60, 60)])
 def test_growth_is_five_per_cent_up_to_the_budget(count: int, budget: int, after: int) -> None:
-    model = Model.start(cloud(count, seed=2))
+    model = OptimizedGaussians.start(cloud(count, seed=2))
     refined = controlled(replace(CONFIG, max_gaussians=budget)).refine(10, model)
     assert len(refined) == after
 
 
 def test_outside_its_window_the_record_is_the_very_same() -> None:
-    model = Model.start(cloud(5, seed=1))
+    model = OptimizedGaussians.start(cloud(5, seed=1))
     assert all(controlled().refine(step, model) is model for step in (1, 9, 110))
 
 
 def test_nothing_alive_moves_nothing() -> None:
-    model = Model.start(replace(cloud(5, seed=1), logit_opacities=torch.full((5,), -9.0)))
+    model = OptimizedGaussians.start(replace(cloud(5, seed=1), logit_opacities=torch.full((5,), -9.0)))
     before = model.gaussians.means.clone()
     refined = controlled().refine(10, model)
     assert torch.equal(refined.gaussians.means[:5], before)
@@ -102,7 +102,7 @@ def test_noise_moves_the_faint_along_their_covariance_and_leaves_the_opaque() ->
     rows = torch.zeros(count, dtype=torch.int64)
     logits = torch.full((count,), math.log(0.005 / 0.995))
     logits[: count // 2] = 2.0
-    model = Model.start(replace(one.select(rows), logit_opacities=logits))
+    model = OptimizedGaussians.start(replace(one.select(rows), logit_opacities=logits))
     controlled().after_step(model, lr_means=1e-3)
     moves = (model.gaussians.means - one.means).double()
     assert not moves[: count // 2].any()
@@ -114,7 +114,9 @@ def test_noise_moves_the_faint_along_their_covariance_and_leaves_the_opaque() ->
 
 
 def test_noise_is_the_same_for_the_same_generator() -> None:
-    models = [Model.start(replace(cloud(9, seed=1), logit_opacities=torch.full((9,), -5.0))) for _ in range(2)]
+    models = [
+        OptimizedGaussians.start(replace(cloud(9, seed=1), logit_opacities=torch.full((9,), -5.0))) for _ in range(2)
+    ]
     for model in models:
         controlled().after_step(model, 1e-3)
     assert torch.equal(models[0].gaussians.means, models[1].gaussians.means)

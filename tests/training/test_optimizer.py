@@ -10,25 +10,25 @@ from gsopt.config.train import OptimizerConfig
 from gsopt.gaussians import PARAMETERS
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Gradients, RasterSettings
-from gsopt.training.optimizer import Model, adam_step, learning_rates
+from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
 
 CONFIG = OptimizerConfig()
 RATES = learning_rates(CONFIG, 1e-3)
 
 
-def random_gradients(model: Model, seed: int) -> Gradients:
+def random_gradients(model: OptimizedGaussians, seed: int) -> Gradients:
     generator = torch.Generator().manual_seed(seed)
     grads = {name: torch.randn(tensor.shape, generator=generator) for name, tensor in model.gaussians.items()}
     return Gradients(**grads, means2d=torch.zeros(len(model), 2), means2d_abs=None)
 
 
-def step(model: Model, seed: int, sh_degree: int) -> None:
+def step(model: OptimizedGaussians, seed: int, sh_degree: int) -> None:
     camera, settings = ring(1, 0.0), RasterSettings(sh_degree=sh_degree)
     adam_step(model, random_gradients(model, seed), RATES, CONFIG, make_backend("reference"), camera, settings)
 
 
-def stepped(steps: int, sh_degree: int = 1) -> Model:
-    model = Model.start(cloud(12, seed=1))
+def stepped(steps: int, sh_degree: int = 1) -> OptimizedGaussians:
+    model = OptimizedGaussians.start(cloud(12, seed=1))
     for seed in range(steps):
         step(model, seed, sh_degree)
     return model
@@ -43,7 +43,7 @@ def test_the_steps_are_those_of_torch() -> None:
         eps=CONFIG.eps,
     )
     for seed in range(5):
-        gradients = random_gradients(Model.start(start), seed)
+        gradients = random_gradients(OptimizedGaussians.start(start), seed)
         for name, leaf in leaves.items():
             leaf.grad = getattr(gradients, name)
         optimizer.step()
@@ -53,7 +53,7 @@ def test_the_steps_are_those_of_torch() -> None:
 
 def test_the_callers_gaussians_are_left_alone() -> None:
     start = cloud(12, seed=1)
-    model = Model.start(start)
+    model = OptimizedGaussians.start(start)
     step(model, 0, 1)
     assert not torch.equal(model.gaussians.means, start.means)
     torch.testing.assert_close(start.means, cloud(12, seed=1).means, rtol=0, atol=0)

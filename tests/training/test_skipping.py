@@ -18,10 +18,10 @@ from gsopt.geometry import sh
 from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Gradients, RasterSettings
+from gsopt.training.content_window import MARGIN, MOST_SHARE, TILE, Window, content_window
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import Target, cropped
 from gsopt.training.trainer import Trainer
-from gsopt.training.window import MARGIN, MOST_SHARE, TILE, Window, content_window
 
 
 @settings(max_examples=60, deadline=None)
@@ -183,8 +183,8 @@ def test_resting_leaves_out_steps_only_after_the_last_refinement(
 def test_every_eighth_step_draws_the_whole_image(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
     original = Trainer._gradients
-    monkeypatch.setattr("gsopt.training.window.MARGIN", 0)
-    monkeypatch.setattr("gsopt.training.window.TILE", 1)
+    monkeypatch.setattr("gsopt.training.content_window.MARGIN", 0)
+    monkeypatch.setattr("gsopt.training.content_window.TILE", 1)
 
     def note(trainer: Trainer, target: Target, *args):
         seen.append(target.colors.shape[0] * target.colors.shape[1])

@@ -32,7 +32,7 @@ def sheet(training: Training) -> Image.Image:
         eps = torch.randn(z.shape, generator=random)
         for column, (share, steps) in zip(columns[1:], ((SHARE, 1), (1.0, STEPS)), strict=True):
             same = Condition(tokens=tokens)
-            look = policies.Look(schedule.step(share), eps, Pair(same, same), Scale())
+            look = policies.NoiseSample(schedule.step(share), eps, Pair(same, same), Scale())
             start = z if share < 1 else torch.zeros_like(z)
             column.append(_shown(training, policies.denoised(training.prior, start, look, steps)))
         columns[0].append(_shown(training, z))

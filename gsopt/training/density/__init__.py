@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsopt.config.train import TrainConfig
 from gsopt.raster.backend import Gradients
-from gsopt.training.optimizer import Model
+from gsopt.training.optimizer import OptimizedGaussians
 
 
 class DensityControl(Protocol):
@@ -22,11 +22,11 @@ class DensityControl(Protocol):
         """Note what one view's backward pass says; image size in px."""
         ...
 
-    def after_step(self, model: Model, lr_means: float) -> None:
+    def after_step(self, model: OptimizedGaussians, lr_means: float) -> None:
         """Change parameters in place after the optimiser step; `lr_means` in scene units."""
         ...
 
-    def refine(self, step: int, model: Model) -> Model:
+    def refine(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Add and remove Gaussians when this step asks for it; the very same record where rows stay the same."""
         ...
 

@@ -15,7 +15,7 @@ from gsopt.geometry import quats as quaternions
 from gsopt.raster.backend import Gradients
 from gsopt.training import schedule
 from gsopt.training.density import at_least_one
-from gsopt.training.optimizer import Model
+from gsopt.training.optimizer import OptimizedGaussians
 
 # A split Gaussian becomes two whose scales are divided by this (Kerbl et al. 2023, section 5.2).
 SPLIT_SHRINK = 1.6
@@ -51,10 +51,10 @@ class Adc:
         self.grad_sum += torch.hypot(v[:, 0] * (0.5 * width), v[:, 1] * (0.5 * height))
         self.seen += radii[:, 0] > 0
 
-    def after_step(self, model: Model, lr_means: float) -> None:
+    def after_step(self, model: OptimizedGaussians, lr_means: float) -> None:
         """Nothing to do between refinements."""
 
-    def refine(self, step: int, model: Model) -> Model:
+    def refine(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Grow, prune and start the statistics afresh; lower all opacities when a reset is due."""
         if schedule.refines(step, self._config, self._iterations):
             model = self._grow_and_prune(step, model)
@@ -72,7 +72,7 @@ class Adc:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         self.grad_sum, self.seen = tensors["grad_sum"], tensors["seen"]
 
-    def _grow_and_prune(self, step: int, model: Model) -> Model:
+    def _grow_and_prune(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Clone small Gaussians and split large ones where the mean gradient is above the threshold; prune both."""
         gaussians = model.gaussians
         scores = self.grad_sum / self.seen.clamp_min(1)
@@ -116,7 +116,7 @@ def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
     return replace(twice, means=twice.means + offsets, log_scales=twice.log_scales - math.log(SPLIT_SHRINK))
 
 
-def lower_opacities(model: Model, opacity: float) -> None:
+def lower_opacities(model: OptimizedGaussians, opacity: float) -> None:
     """Cap every opacity, in place, and forget its moments: what the images need comes back, the rest is pruned."""
     model.gaussians.logit_opacities.clamp_max_(math.log(opacity / (1 - opacity)))
     model.exp_avg.logit_opacities.zero_()

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsopt.config.train import DensityConfig
 from gsopt.raster.backend import Gradients
 from gsopt.training import schedule
-from gsopt.training.optimizer import Model
+from gsopt.training.optimizer import OptimizedGaussians
 
 # Noise is scaled by sigmoid(-STEEPNESS (o - HALF)): only nearly transparent Gaussians wander (the authors' constants).
 STEEPNESS = 100.0
@@ -40,7 +40,7 @@ class Mcmc:
     ) -> None:
         """Needs no statistics."""
 
-    def after_step(self, model: Model, lr_means: float) -> None:
+    def after_step(self, model: OptimizedGaussians, lr_means: float) -> None:
         """Stochastic gradient Langevin dynamics: means += lr · noise_lr · sigmoid(-100 (o - 0.005)) · Σ ξ (eq. 10)."""
         gaussians = model.gaussians
         rows = torch.nonzero(gaussians.logit_opacities < math.log(STEADY / (1 - STEADY)))[:, 0]
@@ -53,7 +53,7 @@ class Mcmc:
         moves = spread(gaussians.quats.index_select(0, rows), gaussians.log_scales.index_select(0, rows), xi)
         gaussians.means.index_copy_(0, rows, moves.add_(gaussians.means.index_select(0, rows)))
 
-    def refine(self, step: int, model: Model) -> Model:
+    def refine(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Move the dead, then grow by a fixed share."""
         if not schedule.refines(step, self._config, self._iterations):
             return model
@@ -69,7 +69,7 @@ class Mcmc:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Nothing to take back."""
 
-    def _relocate(self, model: Model) -> None:
+    def _relocate(self, model: OptimizedGaussians) -> None:
         """Move every Gaussian at or below prune_opacity onto one drawn by opacity; in place."""
         opacities = model.gaussians.opacities
         dead = torch.nonzero(opacities <= self._config.prune_opacity)[:, 0]
@@ -82,7 +82,7 @@ class Mcmc:
             tensor[dead] = tensor[sources]
         model.forget(dead)
 
-    def _grow(self, model: Model) -> Model:
+    def _grow(self, model: OptimizedGaussians) -> OptimizedGaussians:
         """Add copies of Gaussians drawn by opacity, up to growth · N or the budget."""
         target = min(self._budget, int(self._config.growth * len(model)))
         if target <= len(model):
@@ -91,7 +91,7 @@ class Mcmc:
         self._share(model, sources)
         return model.append(model.gaussians.select(sources))
 
-    def _share(self, model: Model, sources: Int[Tensor, "M"]) -> None:
+    def _share(self, model: OptimizedGaussians, sources: Int[Tensor, "M"]) -> None:
         """Make every source as faint and as small as if it and its copies drew what it drew alone; in place."""
         copies = torch.bincount(sources, minlength=len(model)) + 1
         rows = torch.nonzero(copies > 1)[:, 0]

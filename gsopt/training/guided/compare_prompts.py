@@ -18,9 +18,9 @@ from gsopt.raster.backend import Backend
 from gsopt.sds.candidate_views import square_views
 from gsopt.sds.conditioning import Conditioning, encode
 from gsopt.sds.priors.protocol import Prior
-from gsopt.training.guided.guard import WHITE, Left, short_config, short_run, spread_views, without
+from gsopt.training.guided.guard import WHITE, HeldOutView, short_config, short_run, spread_views, without
 from gsopt.training.guided.session import EMBEDDED_INPUTS, front_camera, read_references
-from gsopt.training.mirrors import with_mirrors
+from gsopt.training.mirror_images import with_mirrors
 
 Say = Callable[[str], None]
 
@@ -101,7 +101,7 @@ def compare_prompts(
     return Comparison(tuple(left.view.name for left in lefts), tuple(truths), tuple(outcomes))
 
 
-def _conditioning(config: TrainConfig, left: Left, prior: Prior, arm: Arm) -> Conditioning:
+def _conditioning(config: TrainConfig, left: HeldOutView, prior: Prior, arm: Arm) -> Conditioning:
     """The arm's words and pictures, encoded without the view that is left out."""
     views = left.scene.train
     inputs = square_views(views[:: max(1, -(-len(views) // EMBEDDED_INPUTS))], prior.size, WHITE).images

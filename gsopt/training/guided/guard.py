@@ -65,7 +65,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Left:
+class HeldOutView:
     """One input view left out."""
 
     scene: Scene
@@ -73,7 +73,7 @@ class Left:
     view: View
 
 
-def judge_guidance(
+def evaluate_guidance(
     config: TrainConfig,
     scene: Scene,
     backend: Backend,
@@ -96,7 +96,7 @@ def judge_guidance(
     return _repairs(short, lefts, backend, aid) if prior.aligned else _helps(short, lefts, backend, aid)
 
 
-def _repairs(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid) -> Verdict:
+def _repairs(config: TrainConfig, lefts: list[HeldOutView], backend: Backend, aid: Aid) -> Verdict:
     """Whether the prior's answers are closer to the left-out views than what it is shown."""
     first, last = (of(config.guidance, config.iterations) for of in (sds_schedule.first_step, sds_schedule.last_step))
     steps = [first + (last - first) * look // (LOOKS - 1) for look in range(LOOKS)]
@@ -115,7 +115,7 @@ def _repairs(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid)
     return Verdict(1.0, said, trials) if mean >= REPAIR else Verdict(0.0, f"{said}, {REPAIR:g} are asked for", trials)
 
 
-def _helps(config: TrainConfig, lefts: list[Left], backend: Backend, aid: Aid) -> Verdict:
+def _helps(config: TrainConfig, lefts: list[HeldOutView], backend: Backend, aid: Aid) -> Verdict:
     """The largest factor on lambda at which a guided short run is no worse than one that is not."""
     prior, conditioning, weight, front, warn = aid
     plain = sum(_psnr(config, left, backend, None) for left in lefts) / len(lefts)
@@ -152,11 +152,11 @@ def short_config(config: TrainConfig, scene: Scene, view_conditioned: bool) -> T
     )
 
 
-def without(scene: Scene, index: int) -> Left:
+def without(scene: Scene, index: int) -> HeldOutView:
     """The scene without one of its input views and that one's mirror images."""
     others = tuple(view for i, view in enumerate(scene.train) if i != index)
     images = tuple(image for image in scene.mirrored if image.index != scene.train[index].index)
-    return Left(replace(scene, train=others, mirrored=images), scene.train[index])
+    return HeldOutView(replace(scene, train=others, mirrored=images), scene.train[index])
 
 
 def spread_views(scene: Scene, count: int) -> list[int]:
@@ -166,7 +166,7 @@ def spread_views(scene: Scene, count: int) -> list[int]:
 
 
 def short_run(
-    config: TrainConfig, left: Left, backend: Backend, guide: Aid | None
+    config: TrainConfig, left: HeldOutView, backend: Backend, guide: Aid | None
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
     """The left-out view after a short run on the others, 0..1 on white, and how it really looks."""
     trainer = _trained(config, left, backend, guide)
@@ -175,7 +175,7 @@ def short_run(
     return colors.clamp(0, 1), target.colors
 
 
-def _trained(config: TrainConfig, left: Left, backend: Backend, guide: Aid | None) -> Trainer:
+def _trained(config: TrainConfig, left: HeldOutView, backend: Backend, guide: Aid | None) -> Trainer:
     """A short run at its end."""
     degree = schedule.max_sh_degree(config, len(left.scene.train))
     gaussians, _ = first_gaussians(left.scene, config.init, degree, config.seed)
@@ -186,7 +186,7 @@ def _trained(config: TrainConfig, left: Left, backend: Backend, guide: Aid | Non
     return trainer
 
 
-def _psnr(config: TrainConfig, left: Left, backend: Backend, guide: Aid | None) -> float:
+def _psnr(config: TrainConfig, left: HeldOutView, backend: Backend, guide: Aid | None) -> float:
     """Of the left-out view after a short run on the others, dB."""
     colors, truth = short_run(config, left, backend, guide)
     return float(capped_psnr(colors[None], truth[None]))

@@ -191,7 +191,7 @@ class RunGuidance:
 
     def _open_views(self) -> list[int]:
         """Candidates whose views are the most uncertain, from different directions."""
-        mean_u, candidates = self.guide.memory.mean_u, self.guide.rig.candidates
+        mean_u, candidates = self.guide.memory.mean_u, self.guide.cameras.candidates
         assert mean_u is not None
         chosen: list[int] = []
         for index in torch.sort(mean_u, descending=True, stable=True).indices.tolist():
@@ -208,7 +208,7 @@ class RunGuidance:
         u = coverage.uncertainty(covered)
         white = torch.ones(3)
         for index in self._views:
-            camera = guide.rig.candidates[index]
+            camera = guide.cameras.candidates[index]
             colors = guide.backend.forward(gaussians, camera, settings, white).colors
             shown = coverage.uncertainty_map(gaussians, u, camera, guide.backend)
             pictures = [(f"{when}_{index:02d}", to_bytes(colors)), (f"{when}_{index:02d}_uncertainty", _grey(shown))]

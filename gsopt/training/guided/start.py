@@ -15,7 +15,7 @@ from gsopt.sds.guidance_step import Guide
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.select_prior import choose, fitting
 from gsopt.training import schedule
-from gsopt.training.guided.guard import Verdict, judge_guidance
+from gsopt.training.guided.guard import Verdict, evaluate_guidance
 from gsopt.training.guided.session import CONDITIONING, FOLDER, RunGuidance, front_camera, make_conditioning, make_guide
 from gsopt.training.run_directory import RunDirectory
 
@@ -52,7 +52,7 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
         if decided(config, scene, guide(weight)):
             verdict = Verdict(1.0, "not checked: the input views decide everywhere already", [])
         else:
-            verdict = judge_guidance(config, scene, backend, prior, conditioning, weight, front, directory.warn)
+            verdict = evaluate_guidance(config, scene, backend, prior, conditioning, weight, front, directory.warn)
         recorded = {**recorded, **_told(verdict, prior.name, settled(config.guidance, prior.aligned).policy)}
         directory.record(guidance=recorded)
         directory.emit("guidance", message=_sentence(verdict, weight), **recorded["guard"])

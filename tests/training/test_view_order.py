@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.training.order import ViewOrder, generators
+from gsopt.training.view_order import ViewOrder, generators
 
 
 @settings(max_examples=50, deadline=None)
