@@ -1,9 +1,10 @@
-"""How long the prior that ships takes to be there, and for one answer; writes experiments/results/embedded_prior.json.
+"""How long does the embedded prior take to load, and for one prediction?
 
     python experiments/embedded_prior.py [--threads 2]
 
-Cold: a process of its own that imports, opens and loads the prior and asks it once, at the size that it was trained at.
-Warm: the median of further calls with everything known (render, references, words), at 64 pixels and at that size.
+Cold: a fresh process that imports, opens and loads the prior and evaluates it once, at the size of its training.
+Warm: the median of further calls with all inputs (render, references, text), at 64 pixels and at that size. Writes
+experiments/results/embedded_prior.json.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ CALLS = 15
 
 
 def measure(threads: int) -> dict[str, Any]:
-    """Run in a fresh process: seconds."""
+    """Seconds, in a fresh process."""
     began = time.perf_counter()
     import torch
 
@@ -39,16 +40,16 @@ def measure(threads: int) -> dict[str, Any]:
     assert isinstance(prior, ViewPrior)
     said = Said(torch.zeros(1, 8, TOKEN_WIDTH), torch.ones(1, 8, dtype=torch.bool))
 
-    def ask(side: int) -> float:
+    def call_seconds(side: int) -> float:
         start = time.perf_counter()
         x_t, planes = torch.zeros(1, 3, side, side), torch.zeros(1, CHANNELS - 3, side, side)
         with torch.no_grad():
             predict(prior.unet, x_t, torch.tensor([300]), planes, said)
         return time.perf_counter() - start
 
-    ask(prior.size)
+    call_seconds(prior.size)
     cold = time.perf_counter() - began
-    warm = {str(side): statistics.median(ask(side) for _ in range(CALLS)) for side in (64, prior.size)}
+    warm = {str(side): statistics.median(call_seconds(side) for _ in range(CALLS)) for side in (64, prior.size)}
     return {
         "threads": threads,
         "cold_seconds": round(cold, 2),

@@ -1,10 +1,10 @@
-"""What guidance changes on objects no prior was trained on: the same run without it and with it, held-out metrics.
+"""What does guidance change on objects that no prior was trained on? Runs with and without it, held-out metrics.
 
     python experiments/guidance.py SCENES... [-o FILE.json] [--arm off default ...] [--views 4 6 8] [--seeds 3]
                                   [--prior PRIOR] [--iterations 2000] [--draw]
 
 SCENES are posed scenes with held-out views, or folders of them. Every arm is one run from the same first Gaussians with
-the same steps; runs that have a record in FILE are not made again. The table pairs every arm with `off`, object by
+the same steps; runs with a record in FILE are not repeated. The table pairs every arm with `off`, object by
 object: the mean over objects and seeds, and the standard error over objects, whose seeds are averaged first. --draw
 writes it from FILE into docs/howto/guidance.md without running anything.
 """
@@ -33,8 +33,8 @@ ARMS: dict[str, list[str]] = {
     "sds": SDS,
     "sds, words": [*SDS, "--guidance.references", "0", "--guidance.image-weight", "0"],
 }
-"""`words`: no input view is shown, but the object's name is told. All but `default` are guided, whatever the views, and
-without the guard."""
+"""`words`: the prior gets the object's name instead of input views. All arms but `default` are guided for any number of
+views, and without the guard."""
 NAMES = {
     "off": "unguided",
     "default": "default",
@@ -54,7 +54,7 @@ def scenes(roots: list[Path]) -> list[Path]:
 
 
 def run(scene: Path, views: int, seed: int, arm: str, options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """One run and what it came to."""
+    """The record of one run."""
     shutil.rmtree(folder, ignore_errors=True)
     flags = ["--views", str(views), "--seed", str(seed), "--iterations", str(options.iterations), "--threads", "1"]
     flags += ["--checkpoint-every", "0", "--preview-every", "0", *ARMS[arm]]

@@ -1,4 +1,4 @@
-"""Measures what the kernels' own skips save, on the state of a real run, and checks that they change no bit.
+"""How much time do the kernels' own skips save on the state of a real run? Checks that they change no bit.
 
     python experiments/kernel_skips.py RUN [RUN ...]
 
@@ -40,14 +40,14 @@ SWITCHES = {
     "early termination": ("skip_terminated",),
     "both": ("skip_tiles", "skip_terminated"),
 }
-"""What is switched off."""
+"""Switches that are off."""
 VIEWS = 16
 ROW = {"run": str, "step": int, "gaussians": int, "without": str, "ms": schema.SPREAD, "same_bits": bool}
 DOCUMENT = {"command": str, "machine": schema.MACHINE, "rows": [ROW]}
 
 
 class State:
-    """A run as its newest checkpoint has it."""
+    """The state of a run at its newest checkpoint."""
 
     def __init__(self, run: Path) -> None:
         self.config = TrainConfig.read(run / "config.json")
@@ -62,7 +62,7 @@ class State:
         stride = max(1, len(scene.train) // VIEWS)
         self.targets = [targets.get(i, 1, torch.ones(3)) for i in range(0, len(scene.train), stride)]
         self.backend = CpuBackend(1)
-        self.spent: Gradients | None = None
+        self.gradients: Gradients | None = None
 
     def switch(self, off: tuple[str, ...]) -> None:
         for name in ("skip_tiles", "skip_terminated"):
@@ -71,22 +71,22 @@ class State:
             setattr(self.backend._workspace, name, name not in off)
 
     def iterate(self, target: Target) -> tuple[torch.Tensor, Gradients]:
-        """A full iteration whose rates are so small that the state stays what it is."""
+        """A full iteration with learning rates of 0, which leaves the state as it is."""
         settings = RasterSettings()
         frame = self.backend.forward(self.model.gaussians, target.camera, settings, torch.ones(3))
         loss = self.backend.photometric(frame.colors, target.colors, 0.2)
-        self.spent = self.backend.backward(frame, loss.v_colors, bands=False, into=self.spent)
+        self.gradients = self.backend.backward(frame, loss.v_colors, bands=False, into=self.gradients)
         rates = dict.fromkeys(learning_rates(OptimizerConfig(), 0.0), 0.0)
-        adam_step(self.model, self.spent, rates, OptimizerConfig(), self.backend, target.camera, settings)
-        return frame.colors, self.spent
+        adam_step(self.model, self.gradients, rates, OptimizerConfig(), self.backend, target.camera, settings)
+        return frame.colors, self.gradients
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
-    """One row per switch; views take turns with switches, so that all meet the same load."""
+    """One row per switch; every view is measured with all switches, so that all of them meet the same load."""
     state = State(run)
     seconds: dict[str, list[float]] = {name: [] for name in SWITCHES}
     same = dict.fromkeys(SWITCHES, True)
-    for target in [state.targets[0], *state.targets]:  # the first one twice: it warms up
+    for target in [state.targets[0], *state.targets]:  # the first one twice, to warm up
         truth: list[torch.Tensor] = []
         for name, off in SWITCHES.items():
             state.switch(off)

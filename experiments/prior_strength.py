@@ -1,15 +1,15 @@
-"""How good a prior must be for guidance to help: the prior is replaced by one that knows a share of the truth.
+"""How good must a prior be for guidance to help? An emulated prior predicts a share of the truth.
 
     python experiments/prior_strength.py SCENES... [--arm ...] [--views 4] [--seeds 1] [--json FILE.json] [--draw]
 
-SCENES are posed scenes with held-out views, or folders of them. Of every scene three things are made: `truth`, a
-reconstruction from all its input views; `off`, the unguided run from few; and guided runs from the same few. Where the
-prior would be asked for a camera's image, the emulated one answers with
+SCENES are posed scenes with held-out views, or folders of them. Every scene is reconstructed as `truth`, from all its
+input views; as `off`, the unguided run from few; and by guided runs from the same few. The emulated prior predicts for
+a camera
 
     (1)  y = r0 + s (y* - r0)
 
-r0 drawn from `off` and y* from `truth`. So it repairs what separates `off` from `truth` by -20 log10(1 - s) dB in every
-view, consistently: the most that a prior of that strength can do. Runs that have a record are not made again.
+with r0 rendered from `off` and y* from `truth`. This reduces the error of `off` by -20 log10(1 - s) dB in every view,
+consistently, which is the best that a prior of that strength can do. Runs with a record are not repeated.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from gsopt.sds.priors.view_conditioned import cosine_schedule
 PAGE = Path(__file__).parents[1] / "docs" / "howto" / "guidance.md"
 RESULT = Path(__file__).parent / "results" / "prior_strength.json"
 SIZE = 128
-"""Of the renders that the prior is asked about, px: what the embedded one was made for."""
+"""Side of the prior's images, px, as of the embedded one."""
 WHITE = torch.ones(3)
 EXACT = math.inf
 UNGUARDED = ["--guidance.guard-views", "0"]
 EVERYWHERE = [*UNGUARDED, "--guidance.min-uncertainty", "0", "--guidance.certain-weight", "1"]
-"""Every view and every pixel of the subject alike, whatever the input views decide."""
+"""Equal weight for every view and every pixel of the object."""
 UNCERTAIN = [*UNGUARDED, "--guidance.min-uncertainty", "0.05", "--guidance.certain-weight", "0"]
-"""Weighted by what no input view shows."""
+"""Weight by uncertainty: pixels that no input view determines."""
 ARMS: dict[str, tuple[float | None, list[str]]] = {
     "off": (None, ["--lambda-sds", "0"]),
     "exact, only what is uncertain, lambda 0.05": (EXACT, [*UNCERTAIN, "--lambda-sds", "0.05"]),
@@ -57,7 +57,7 @@ ARMS: dict[str, tuple[float | None, list[str]]] = {
     "exact": (EXACT, EVERYWHERE),
     **{f"{repair:g} dB": (repair, EVERYWHERE) for repair in (4.0, 2.0, 1.0, 0.5)},
 }
-"""By how much the prior repairs, dB (None: no prior), and flags."""
+"""Gain of the prior in dB (None: no prior), and flags."""
 METRICS = ("psnr", "ssim", "lpips_alex")
 
 
@@ -71,7 +71,7 @@ class Emulated:
     aligned = True
 
     def __init__(self, truth: FinishedRun, off: FinishedRun, repair: float) -> None:
-        """`repair`: of what `off` got wrong, in dB."""
+        """`repair`: reduction of the error of `off`, dB."""
         self.schedule = cosine_schedule()
         self._truth, self._off, self._share = truth, off, 1 - 10 ** (-repair / 20)
 
@@ -94,12 +94,12 @@ class Emulated:
 
 
 def drawn(run: FinishedRun, camera: Cameras) -> Tensor:
-    """On white, 0..1."""
+    """The render on white, 0..1."""
     return run.backend.forward(run.gaussians, camera, run.settings, WHITE).colors.permute(2, 0, 1).clamp(0, 1)
 
 
 def train(scene: Path, folder: Path, flags: Sequence[str]) -> dict[str, Any]:
-    """A run anew, and what it came to."""
+    """The metrics of a new run."""
     shutil.rmtree(folder, ignore_errors=True)
     quiet = ["--threads", "1", "--checkpoint-every", "0", "--preview-every", "0"]
     if code := gsopt(["train", str(scene), "-m", str(folder), *quiet, *flags]):
@@ -112,7 +112,7 @@ def train(scene: Path, folder: Path, flags: Sequence[str]) -> dict[str, Any]:
 
 
 def make(scene: Path, views: int, seed: int, arms: Sequence[str], runs: Path, known: dict[str, Any]) -> None:
-    """The runs of one scene that `known` lacks, by arm, into it."""
+    """Adds to `known` the runs of one scene that it lacks, by arm."""
     folder = runs / f"{scene.name}_{views}_{seed}"
     few = ["--views", str(views), "--seed", str(seed)]
     if "truth" not in known or not (folder / "truth" / "splat.ply").exists():

@@ -1,14 +1,14 @@
-"""What prompts change: the same guided run with none, the user's own, the template's and a language model's prompts.
+"""What do prompts change? The same guided run without prompts and with those of a user, a template, a language model.
 
     python experiments/prompts.py SCENES... [-o experiments/results/prompts.json] [--notes FILE]
                                  [--prior PRIOR] [--llm URL --model NAME] [--views 4] [--seeds 3] [--iterations 2000]
 
-SCENES are posed scenes with held-out views, or folders of them; the notes file says for each, by its folder's name,
-what an expert would. Everything but the prompts is the same in every arm, `off` is the run without guidance. Runs that
-have a record in the result file are not made again. --draw prints the table from that file without running anything.
+SCENES are posed scenes with held-out views, or folders of them; the notes file has an expert's notes for each, by
+the name of its folder. Everything but the prompts is the same in every arm; `off` is the run without guidance. Runs
+with a record in the result file are not repeated. --draw prints the table from that file without running anything.
 
-A prior that takes no words gives the same bits with any prompts: the result file says so in `takes_words`, and such
-a table says nothing about prompts.
+A prior without a text encoder gives the same bits with any prompts: the result file records it in `takes_words`, and
+its table is no evidence about prompts.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def scenes(roots: list[Path]) -> list[Path]:
 
 
 def write_arm(scene: Path, arm: str, note: dict[str, str], options: argparse.Namespace) -> Path | None:
-    """The arm's prompts.json in the folder of runs; None for an arm without prompts. Made once per scene."""
+    """The arm's prompts.json in the folder of runs; None for an arm without prompts. Generated once per scene."""
     path: Path = options.runs / f"{scene.name}-{arm}.json"
     if arm in ("off", "none"):
         return None
@@ -57,7 +57,7 @@ def write_arm(scene: Path, arm: str, note: dict[str, str], options: argparse.Nam
 
 
 def run(scene: Path, seed: int, arm: str, note: dict[str, str], options: argparse.Namespace) -> dict[str, Any]:
-    """One training run and what it came to."""
+    """The record of one training run."""
     folder: Path = options.runs / f"{scene.name}-{options.views}-{seed}-{arm}"
     shutil.rmtree(folder, ignore_errors=True)
     flags = ["--views", str(options.views), "--seed", str(seed), "--iterations", str(options.iterations)]
@@ -87,7 +87,7 @@ def require(code: int, what: str) -> None:
 
 
 def takes_words(prior: str) -> bool:
-    """Whether the prior has a text encoder."""
+    """True when the prior has a text encoder."""
     from gsopt.config.guidance import GuidanceConfig
     from gsopt.sds.load_prior import open_prior
 
@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Every run that has no record yet; the file is written after each."""
+    """Executes every run without a record and writes the file after each."""
     notes = json.loads(options.notes.read_text())
     arms = options.arm or [arm for arm in ARMS if arm != "llm" or options.llm]
     options.runs.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""What `--refine-poses` is worth: the same scene with true poses, with disturbed ones, and with those corrected.
+"""How much does `--refine-poses` recover? The same scene with true poses, disturbed poses, and refined poses.
 
 python experiments/refine_poses.py --data DATA/nerf_synthetic_lego_400 --work WORK writes
-experiments/results/refine_poses.json. Every input camera is turned by --degrees about a random axis through itself and
-moved by the same angle's worth of its distance from the origin; held-out views keep the true poses. One seed.
+experiments/results/refine_poses.json. Every input camera is rotated by --degrees about a random axis through itself and
+moved by that angle (in radians) times its distance from the origin; held-out views keep the true poses. One seed.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def disturb(data: Path, target: Path, degrees: float) -> Path:
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """By `angle` about `axis` (Rodrigues)."""
+    """Rotation by `angle` about `axis` (Rodrigues)."""
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
@@ -86,7 +86,7 @@ def trained(data: Path, run: Path, flags: list[str]) -> dict[str, Any]:
 
 
 def pose_error(data: Path, run: Path, truth: Path) -> dict[str, Any]:
-    """Of the input cameras that the run ended with, after the best similarity."""
+    """Error of the run's final input cameras after the best similarity."""
     from gsopt.data.scene import read_dataset
     from gsopt.data.sfm.trajectory import compare
 

@@ -1,10 +1,10 @@
-"""Trains the scenes that README.md and docs/performance.md quote and records their figures.
+"""Which quality, time and memory does training reach on the scenes that README.md and docs/performance.md quote?
 
     python experiments/scenes.py --root DATA [--case lego-100 ...] [--runs FOLDER]
 
 DATA holds `nerf_synthetic_lego_400` and `fox` (see `CASES`). Every case is one `gsopt train` in a process of its own;
 its held-out metrics, wall time, peak memory, the resolved configuration and the machine go into
-experiments/results/scenes.json, one record per case. Cases that were not asked for keep their records.
+experiments/results/scenes.json, one record per case. Cases that are not named keep their records.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def run_case(name: str, root: Path, runs: Path) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures depend on besides the code."""
+    """Metadata of the machine."""
     cpu = platform.processor()
     info = Path("/proc/cpuinfo")
     if info.exists():

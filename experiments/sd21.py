@@ -1,10 +1,9 @@
-"""What a guided step by Stable Diffusion 2.1 needs of a GPU, counted per tensor; writes the table of
-docs/howto/guidance.md.
+"""How much GPU memory does a guided step with Stable Diffusion 2.1 need? Writes the table of docs/howto/guidance.md.
 
     python experiments/sd21.py
 
-No weights are needed and nothing is computed: tests/sds/real_memory.py lets the networks at their real size say which
-tensors they would make. Memory that a convolution uses inside itself, and CUDA's own, is not in the count.
+Needs no weights and computes nothing: tests/sds/real_memory.py counts the tensors that the networks of real size would
+allocate. The workspace of convolutions and the memory of CUDA itself are not counted.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ COLUMNS = {
     "kept": "kept by its encoder",
     "call": "U-Net's call",
     "backward": "encoder backwards",
-    "total": "most at once",
+    "total": "peak",
     "picture": "picture for the report",
 }
 

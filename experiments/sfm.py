@@ -1,10 +1,10 @@
-"""How well `gsopt sfm` finds poses that are known: each mapper on one database, and what training makes of them.
+"""How accurate are the poses of `gsopt sfm`? Each mapper on one database with known poses, and training on them.
 
 python experiments/sfm.py --photos DATA/fox --work WORK [--video] [--train] writes its results/sfm.json. DATA/fox
-has photos and transforms.json; the poses in it are the truth, hidden from `gsopt sfm`. --video first makes an H.264
-file of the photos and starts from that. Features and matches are made once; each mapper then runs in a process of its
-own, so that its time and memory are its own. Times are CPU seconds (user + system) of one thread. What --train compares
-are the found poses and, on exactly the same pixels and photos, the given ones.
+has photos and transforms.json; its poses are the truth, hidden from `gsopt sfm`. --video first encodes the
+photos as H.264 and starts from that file. Features and matches are computed once; each mapper then runs in a process of
+its own, for separate time and memory. Times are CPU seconds (user + system) of one thread. --train compares training
+with the found poses and with the given ones, on the same pixels and photos.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def once(path: Path, function: Any, *arguments: Any) -> dict[str, Any]:
-    """What `function` found, measured in a fresh process; kept in `path`, so that an interrupted benchmark goes on."""
+    """Result of `function` in a fresh process, kept in `path`, so that an interrupted experiment can continue."""
     if not path.is_file():
         with get_context("spawn").Pool(1) as pool:
             found = pool.apply(measured, (function, *arguments))
@@ -62,7 +62,7 @@ def once(path: Path, function: Any, *arguments: Any) -> dict[str, Any]:
 
 def measured(function: Any, *arguments: Any) -> dict[str, Any]:
     """The function's figures with CPU seconds and peak memory of this process."""
-    import pycolmap  # its import is no part of the time
+    import pycolmap  # its import is not measured
 
     pycolmap.logging.minloglevel = 3
     began = time.process_time()
@@ -195,7 +195,7 @@ def compared(options: argparse.Namespace, mapper: str) -> dict[str, Any]:
 
 
 def given_scene(options: argparse.Namespace, names: list[str]) -> Path:
-    """A scene with these photos, as `gsopt sfm` read them, at the given poses and lenses."""
+    """A scene with these photos, as `gsopt sfm` reads them, and the given poses and lenses."""
     scene = options.work / f"given-{len(names)}"
     if scene.exists():
         return scene
@@ -230,7 +230,7 @@ def frame_row(frame: Any, opengl_from_viewmats: Any) -> dict[str, Any]:
 
 
 def trained(options: argparse.Namespace, scene: Path, run: Path) -> dict[str, Any]:
-    """Held-out figures after training; an earlier run in the same folder is taken as it is."""
+    """Held-out metrics after training; an earlier run in the same folder is reused."""
     if not (run / "metrics.json").is_file():
         command = [sys.executable, "-m", "gsopt", "train", str(scene), "-m", str(run), *training(options), "--resume"]
         subprocess.run(command, check=True)

@@ -1,13 +1,13 @@
-"""Measures what each skip saves and costs at 7000 steps, and writes the table of docs/performance.md.
+"""What does each skip save and cost at 7000 steps? Writes the table of docs/performance.md.
 
     python experiments/skips.py --root DATA [--arm lego-plain ...] [--runs FOLDER] [--draw]
 
 DATA holds `nerf_synthetic_lego_400` and `fox`. Arms of each scene: `plain` (every skip off but the kernels' own),
-`bare` (those off as well), `all` (every skip on), `free` (beside the kernels' own only those whose row says no more
-than 0.1 dB on either scene), `no-X` (every skip but X), and `plain` and `free` again with other seeds. An arm is one
+`bare` (those off as well), `all` (every skip on), `free` (the kernels' own and those whose row shows at most
+0.1 dB on either scene), `no-X` (every skip but X), and `plain` and `free` again with other seeds. An arm is one
 `gsopt train --threads 1` in a process of its own; its CPU time (user and system, all threads, over the training steps
-alone) and its held-out metrics go to experiments/results/skips.json. Arms that have a record are not measured again, an
-arm that was cut short goes on from its last checkpoint, and a skip that acts late forks from the checkpoint of `all` at
+alone) and its held-out metrics go to experiments/results/skips.json. Arms with a record are not measured again, an
+interrupted arm continues from its last checkpoint, and a skip that acts late forks from the checkpoint of `all` at
 step 4000. --draw writes the table without measuring.
 """
 
@@ -33,10 +33,10 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "experiments" / "results" / "skips.json"
 PAGE = ROOT / "docs" / "performance.md"
 FORK = 4000
-"""Before the last refinement of 7000 steps, which views that rest and flat losses wait for."""
+"""Step before the last refinement of 7000 steps; resting views and the flat-loss stop act after it."""
 TOGETHER = (("plain", "bare"), ("free", "plain"), ("free", "bare"), ("all", "plain"), ("all", "bare"))
 SEEDS = (1, 2)
-"""Beside 0, for the arms that say what is free."""
+"""Further seeds of the arms `plain` and `free`."""
 METRICS = ("psnr", "ssim", "lpips_alex")
 RECORD = {
     "scene": str,
@@ -56,7 +56,7 @@ DOCUMENT = {"command": str, "records": [RECORD]}
 
 @dataclass(frozen=True)
 class Skip:
-    """One thing that a run may leave out."""
+    """One computation that a run may skip."""
 
     name: str
     what: str
@@ -94,7 +94,7 @@ SKIPS = (
     Skip("bands", "SH bands by the residual", ("--schedule.bands", "residual"), ("--schedule.bands", "steps")),
 )
 FREE = ("coarse", "crop", "flat")
-"""What `free` leaves out beside the kernels' own: by the rows of the table."""
+"""Skips of `free` besides the kernels' own, by the rows of the table."""
 BARE = """
 import sys
 from gsopt.cli import main
@@ -135,7 +135,7 @@ def key(scene: str, name: str, seed: int = 0) -> str:
 
 
 def arms() -> list[Arm]:
-    """The most telling first."""
+    """Every arm, the most informative first."""
     found = [
         Arm(scene, name, tuple(flag for skip in SKIPS for flag in getattr(skip, way)))
         for scene in SCENES
@@ -152,7 +152,7 @@ def arms() -> list[Arm]:
 
 
 def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[str, Any] | None:
-    """The record of one arm; None where it waits for `all`."""
+    """The record of one arm, or None until `all` has one."""
     full = records.get(f"{arm.scene}-all")
     if arm.without is not None and full is None:
         return None
@@ -185,7 +185,7 @@ def measure(arm: Arm, root: Path, runs: Path, records: dict[str, Any]) -> dict[s
 
 
 def finish(arm: Arm, command: list[str], run: Path) -> None:
-    """Start or continue the run until it is judged."""
+    """Starts or continues the run until it is evaluated."""
     process = subprocess.Popen(command)
     while process.poll() is None:
         keep_fork(run)
@@ -195,7 +195,7 @@ def finish(arm: Arm, command: list[str], run: Path) -> None:
 
 
 def changes_nothing(arm: Arm, runs: Path) -> bool:
-    """Whether the run without this skip would be `all` bit for bit."""
+    """True when the run without this skip equals `all` bit for bit."""
     assert arm.without is not None
     if arm.without.needs_masks and not SCENES[arm.scene][2]:
         return True
@@ -274,7 +274,7 @@ def pairs(records: dict[str, Any], scene: str, without: str, full: str) -> list[
 
 
 def difference(both: list[tuple[dict[str, Any], dict[str, Any]]]) -> list[str]:
-    """What a skip saves and changes, the mean of the pairs: the second of each has it, the first does not."""
+    """Savings and changes by a skip, as means over pairs of (run without it, run with it)."""
     if both[0][0]["same_as"]:
         return ["0 (the same run)", "0", "0", "0"]
     without, full = (sum(pair[k]["cpu_seconds"] for pair in both) / len(both) for k in (0, 1))

@@ -1,8 +1,8 @@
-"""Measures the stress suite and writes the table of docs/performance.md.
+"""How accurate are the kernels on adversarial scenes? Writes the table of docs/performance.md.
 
     python experiments/stress.py
 
-The cases are those of tests/raster/stress_cases.py; what they gave on every instruction set of this processor goes to
+The cases are those of tests/raster/stress_cases.py; the errors on every instruction set of this processor go to
 experiments/results/stress.json.
 """
 

@@ -23,7 +23,7 @@ WHITE = torch.ones(3)
 
 
 def splats(count: int = 12, seed: int = 0) -> Gaussians:
-    """A few coloured blobs around the origin, float32."""
+    """A few colored blobs around the origin, float32."""
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=0.6 * torch.randn(count, 3, generator=generator),

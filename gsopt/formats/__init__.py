@@ -1,9 +1,9 @@
-"""How splats leave and return: one reader and one writer, the format chosen by the file's suffix.
+"""Splat files: one reader and one writer, which choose the format by the file's suffix.
 
 | suffix | format | loss |
 |---|---|---|
 | `.ply` | Inria PLY | none |
-| `.compressed.ply` | PlayCanvas compressed PLY | quantised in chunks of 256 |
+| `.compressed.ply` | PlayCanvas compressed PLY | quantized in chunks of 256 |
 | `.splat` | antimatter15 | no view-dependent color, 8-bit color and rotation |
 | `.spz` | Niantic SPZ | 24-bit position, 8-bit rest |
 | `.glb` | glTF, KHR_gaussian_splatting | rounding of exp and sigmoid |
@@ -35,7 +35,7 @@ def suffix_of(path: Path) -> str:
 def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write `gaussians` in the format that the suffix of `path` names; whole file or nothing.
 
-    `antialiased`: the splats were optimised with the 2D filter of Mip-Splatting; noted where the format can (.ply,
+    `antialiased`: the splats were optimized with the 2D filter of Mip-Splatting; recorded by formats that can (.ply,
     .spz). Raises InputError for a row that is not finite, a rotation of length zero, a full disk or an unknown suffix.
     """
     path = Path(path)
@@ -65,8 +65,8 @@ def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased:
 def load_splats(path: str | PathLike[str]) -> Gaussians:
     """Read splats in the format that the suffix of `path` names; float32 on the CPU, every value finite.
 
-    The file is not trusted: what it claims is checked against its size before memory is taken. Raises InputError
-    for whatever is wrong with it.
+    The file is not trusted: its header is checked against its size before memory is allocated. Raises InputError for
+    any defect.
     """
     path = Path(path)
     match suffix_of(path):
@@ -89,7 +89,7 @@ def load_splats(path: str | PathLike[str]) -> Gaussians:
 
 
 def is_antialiased(path: str | PathLike[str]) -> bool:
-    """Whether a file says that its splats want the 2D filter of Mip-Splatting; False for formats that cannot say it."""
+    """True when a file records that its splats need the 2D filter of Mip-Splatting; some formats cannot record it."""
     path = Path(path)
     match suffix_of(path):
         case ".ply":

@@ -1,8 +1,8 @@
-"""From the frame of a PLY (x right, y down, z forward) to that of another format, by turning axes around.
+"""Conversion from the axes of a PLY (x right, y down, z forward) to those of another format, by flipping axes.
 
-Turning axes only changes signs, so going there and back gives the same bits. For S = diag(signs) a mean m becomes
-S m and a rotation R becomes S R S, which leaves the covariance R D² Rᵀ in step with the means because S D² S = D².
-A spherical harmonic is even or odd in each axis (gsopt.geometry.sh lists the polynomials), hence its sign too.
+Flips only change signs, so a round trip gives the same bits. For S = diag(signs) a mean m becomes
+S m and a rotation R becomes S R S, which transforms the covariance R D² Rᵀ like the means because S D² S = D².
+A spherical harmonic is even or odd in each axis (gsopt.geometry.sh lists the polynomials), which gives its sign.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _ODD_IN = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "
 
 
 def with_flipped_axes(gaussians: Gaussians, signs: Signs) -> Gaussians:
-    """The same splats after the axes with sign -1 were turned around; its own inverse. A proper rotation needs two."""
+    """The same splats with flipped axes where the sign is -1; its own inverse. A proper rotation flips two."""
     x, y, z = signs
     sign = {"x": x, "y": y, "z": z}
     parities = [math.prod(sign[axis] for axis in axes) for axes in _ODD_IN[: gaussians.shN.shape[1]]]

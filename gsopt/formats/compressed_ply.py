@@ -104,7 +104,7 @@ def _pack(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint32]
 
 
 def _join(parts: NDArray[np.float64], bits: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Columns in [0, 1] as unsigned integers of so many bits, the first one highest."""
+    """Columns in [0, 1] packed as unsigned integers of `bits` bits, the first one highest."""
     word = np.zeros(len(parts), np.uint32)
     for column, width in zip(parts.T, bits, strict=True):
         greatest = (1 << width) - 1
@@ -149,7 +149,7 @@ def _unpack_bands(codes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def load_any_ply(path: Path) -> Gaussians:
-    """Read a PLY of either kind, told apart by the element `chunk`; the rows keep the file's order."""
+    """Reads a PLY of either kind, distinguished by the element `chunk`; the rows keep the file's order."""
     with opened(path) as (file, size):
         header = read_header(file, path)
         read = read_splats if header.element("chunk") is None else read_compressed
@@ -157,13 +157,13 @@ def load_any_ply(path: Path) -> Gaussians:
 
 
 def read_compressed(file: BinaryIO, header: Header, file_size: int, path: Path) -> Gaussians:
-    """Read the chunks of a PLY whose header was just read from `file`."""
+    """Reads the chunks of a PLY whose header was just read from `file`."""
     chunk, vertex, bands = _elements(header, path)
     extremes = np.empty((chunk.count, len(_EXTREMES)))
     extremes[:, len(_WITHOUT_COLOR) :] = [0, 0, 0, 1, 1, 1]
     seek_element(file, header, chunk, file_size, path)
     names = [name for name in _EXTREMES if name in chunk.names]
-    with np.errstate(invalid="ignore"):  # a NaN is named and refused with the splats that it makes
+    with np.errstate(invalid="ignore"):  # `checked` refuses the splats of a NaN
         for rows, block in _placed(float_blocks(file, header, chunk, path)):
             extremes[rows, : len(names)] = block[:, [chunk.names.index(name) for name in names]]
     file.seek(header.size)
@@ -187,7 +187,7 @@ def _read_bands(file: BinaryIO, header: Header, bands: Element, file_size: int, 
 
 
 def _placed(blocks: Iterable[Block]) -> Iterator[tuple[slice, Block]]:
-    """(rows that it fills, block) for blocks in order."""
+    """(rows, block) for blocks in order."""
     start = 0
     for block in blocks:
         yield slice(start, start + len(block)), block
@@ -195,7 +195,7 @@ def _placed(blocks: Iterable[Block]) -> Iterator[tuple[slice, Block]]:
 
 
 def _elements(header: Header, path: Path) -> tuple[Element, Element, Element | None]:
-    """The elements chunk, vertex and sh, or InputError saying what of the layout is not as it must be."""
+    """The elements chunk, vertex and sh; InputError names the defect of any other layout."""
     chunk, vertex, bands = (header.element(name) for name in ("chunk", "vertex", "sh"))
     wrong = "is text" if not header.byte_order else _wrong(chunk, vertex, bands)
     if wrong or chunk is None or vertex is None:
@@ -222,7 +222,7 @@ def _unpack(extremes: NDArray[np.float64], packed: NDArray[np.uint32], shN: NDAr
     color = _split(packed[:, 3], _BITS_4)
     parts = (_split(packed[:, 0], _BITS_3), _split(packed[:, 2], _BITS_3), color[:, :3])
     chunk = np.arange(len(packed)) // CHUNK
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named and refused by the caller
+    with np.errstate(over="ignore", invalid="ignore"):  # `checked` refuses what is not finite
         means, log_scales, rgb = (
             torch.from_numpy((low[chunk] * (1 - part) + high[chunk] * part).astype(np.float32))
             for part, low, high in zip(parts, *(np.split(extremes, 6, axis=1)[i::2] for i in (0, 1)), strict=True)

@@ -1,4 +1,4 @@
-"""Unpacking compressed streams that are not trusted: never more bytes than the caller asks for."""
+"""Compression of streams, and bounded decompression of untrusted ones."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from gsopt.formats.files import read_exactly
 
 _PIECE = 1 << 16
 _GZIP_WINDOW = 16 + zlib.MAX_WBITS
-_SMALL = 1 << 26
-"""Bytes that may always be unpacked (64 MiB)."""
+_ALWAYS_ALLOWED = 1 << 26
+"""Bytes that any file may unpack to (64 MiB)."""
 _MAX_RATIO = 50
 """Beyond 64 MiB, a file may unpack to this many times its size; real splats reach about 5."""
 
 
 def check_ratio(unpacked: int, packed: int, path: Path) -> None:
-    """InputError when `unpacked` bytes out of a file of `packed` bytes can only be an attack or damage."""
-    if unpacked > max(_SMALL, _MAX_RATIO * packed):
+    """InputError when `unpacked` bytes out of a file of `packed` bytes are implausible."""
+    if unpacked > max(_ALWAYS_ALLOWED, _MAX_RATIO * packed):
         raise InputError(
             f"{path} claims to unpack from {packed} to {unpacked} bytes, {_MAX_RATIO} times its size is the limit. "
             "It is damaged or hostile: export it again."
@@ -29,7 +29,7 @@ def check_ratio(unpacked: int, packed: int, path: Path) -> None:
 
 
 class GzipStream:
-    """A gzip stream taken apart piece by piece."""
+    """A gzip stream, decompressed piece by piece."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path = file, path
@@ -47,7 +47,7 @@ class GzipStream:
         return bytes(out)
 
     def finish(self) -> None:
-        """Read to the end, where gzip's checksum is compared; InputError when it differs or more data follows."""
+        """Reads to the end, where zlib compares the checksum; InputError when it differs or more data follows."""
         while not self._zlib.eof:
             if self._step(1):
                 raise InputError(f"{self._path} holds more than its header says. Export it again.")
@@ -65,10 +65,10 @@ class GzipStream:
 
 
 def deflated(parts: Iterable[bytes]) -> Iterator[bytes]:
-    """The parts as one gzip stream, without a time stamp: same splats, same bytes.
+    """The parts as one gzip stream without a time stamp, so that equal splats give equal bytes.
 
-    Run lengths and Huffman codes only: quantised splats hold few longer repeats, so looking for them costs ten times
-    the time and makes the stream larger.
+    Run lengths and Huffman codes only: quantized splats have few longer repeats, and a search for them takes ten times
+    as long and enlarges the stream.
     """
     packer = zlib.compressobj(6, zlib.DEFLATED, _GZIP_WINDOW, 9, zlib.Z_RLE)
     for part in parts:

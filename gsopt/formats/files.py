@@ -1,4 +1,4 @@
-"""Opening what comes in and replacing what goes out: bounded reads, whole-or-nothing writes."""
+"""Reads and writes of splat files: bounded reads, whole-or-nothing writes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _remove(temporary: Path) -> None:
     try:
         temporary.unlink(missing_ok=True)
     except OSError:
-        return  # its folder is gone or closed to us: nothing of ours is left to remove
+        return  # the folder is gone or not writable: no temporary file is left
 
 
 @contextmanager
@@ -65,7 +65,7 @@ def opened(path: Path) -> Iterator[tuple[BinaryIO, int]]:
 
 
 def read_exactly(file: BinaryIO, count: int, path: Path, what: str) -> bytes:
-    """`count` bytes, or InputError saying what was being read. The caller has checked `count` against the file size."""
+    """`count` bytes; InputError names `what` at an early end. The caller has checked `count` against the file size."""
     data = file.read(count)
     if len(data) != count:
         raise InputError(f"{path} ends inside {what}: {count} bytes needed, got {len(data)}. Export or copy it again.")

@@ -1,4 +1,4 @@
-"""The container of a .glb and its JSON, read without trusting either.
+"""Reads the container of an untrusted .glb and its JSON.
 
 Source: Khronos, glTF 2.0, section 4.4 (binary glTF layout).
 """

@@ -1,6 +1,6 @@
-"""Finding splats in a glTF document: which primitives, which accessors, which bytes.
+"""Finds the splats of a glTF document: primitives, accessors, bytes.
 
-Sources: Khronos, glTF 2.0, section 3.6 (accessors and their normalised integers), and KHR_gaussian_splatting.
+Sources: Khronos, glTF 2.0, section 3.6 (accessors and their normalized integers), and KHR_gaussian_splatting.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Accessor:
     normalized: bool
 
     def read(self, file: BinaryIO, document: Document) -> NDArray[np.float32]:
-        """Values [count, components] as float32, normalised integers brought to [0, 1] or [-1, 1]."""
+        """Values [count, components] as float32, normalized integers mapped to [0, 1] or [-1, 1]."""
         element = self.components * self.kind.itemsize
         file.seek(self.offset)
         data = read_exactly(file, self.stride * (self.count - 1) + element, document.path, "an accessor")
@@ -52,7 +52,7 @@ class Accessor:
 
 
 def splat_primitives(document: Document) -> list[dict[str, Accessor]]:
-    """Semantic -> accessor of every primitive of splats; InputError when there is none or one cannot be read right."""
+    """Semantic -> accessor of every primitive of splats; InputError when there is none or one is not supported."""
     unknown = sorted(set(document.names("extensionsRequired")) - _UNDERSTOOD)
     if unknown:
         document.fail(f"needs extensions that gsopt does not know: {', '.join(unknown)[:80]}")
@@ -86,7 +86,7 @@ def _check_extension(document: Document, extension: Mapping[str, Any]) -> None:
 
 
 def _check_placement(document: Document, mesh: int) -> None:
-    """InputError if a node moves, turns or scales this mesh: the splats' harmonics would have to turn along."""
+    """InputError if a node moves, rotates or scales this mesh: the spherical harmonics would need the same rotation."""
     nodes = document.objects(document.root, "nodes")
     pending = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
     parents: dict[int, list[int]] = {}

@@ -31,7 +31,7 @@ _FLOAT, _BYTE = 5126, 5121
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAX_SIZE = (1 << 32) - 1
 _OPACITY_MARGIN = 2.0**-25
-"""Nearer to 0 or 1 a float32 sigmoid cannot say."""
+"""Least distance of a float32 sigmoid from 0 and 1."""
 
 
 def save_glb(path: Path, gaussians: Gaussians) -> None:

@@ -1,4 +1,4 @@
-"""The Inria PLY: lossless, and what every other splat tool reads.
+"""The Inria PLY: lossless, and read by every other splat tool.
 
 One element `vertex`, all properties float32: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all of red, then green, then
 blue), opacity (logit), scale_* (natural logarithm), rot_0..3 (w x y z). Layout: Kerbl et al. 2023, the reference
@@ -29,13 +29,13 @@ _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh0": (1, 3)}
-"""Of one row; that of shN depends on the degree."""
+"""Shape of one row; that of shN depends on the degree."""
 
 
 def save_ply(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write binary little endian float32; reading it back gives the same bits. Whole file or nothing.
 
-    `antialiased` notes in the header that the splats were optimised with the 2D filter of Mip-Splatting.
+    `antialiased` records in the header that the splats were optimized with the 2D filter of Mip-Splatting.
     """
     gaussians = storable(gaussians, path)
     comments = [
@@ -53,13 +53,13 @@ def _header(gaussians: Gaussians, comments: list[str]) -> bytes:
     bands = gaussians.shN.shape[1]
     rest = tuple(f"f_rest_{i}" for i in range(3 * bands))
     row = np.dtype([(name, "<f4") for name in (*_MEANS, *_NORMALS, *_SH0, *rest, "opacity", *_SCALES, *_QUATS)])
-    rows = np.broadcast_to(np.zeros((), row), (len(gaussians),))  # as many rows as there are splats, in no memory
+    rows = np.broadcast_to(np.zeros((), row), (len(gaussians),))  # a row per splat, without memory
     header: str = PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<", comments=comments).header
     return header.encode("ascii") + b"\n"
 
 
 def _interleave(gaussians: Gaussians, rows: slice) -> NDArray[np.float32]:
-    """A block [rows, properties] in file order; a block at a time stays in the cache and doubles no memory."""
+    """A block [rows, properties] in file order; one block fits into the cache."""
     parts = {name: tensor[rows].numpy() for name, tensor in gaussians.items()}
     n, bands = len(parts["means"]), gaussians.shN.shape[1]
     block = np.zeros((n, 17 + 3 * bands), "<f4")
@@ -73,7 +73,7 @@ def _interleave(gaussians: Gaussians, rows: slice) -> NDArray[np.float32]:
 
 
 def ply_antialiased(path: Path) -> bool:
-    """Whether the header says that its splats were optimised with the 2D filter of Mip-Splatting."""
+    """True when the header records that its splats were optimized with the 2D filter of Mip-Splatting."""
     with opened(path) as (file, _):
         comments = [comment.lower() for comment in read_header(file, path).comments]
     return "splatrendermode: mip" in comments or "antialiased 1" in comments
@@ -113,7 +113,7 @@ def _columns(bands: int) -> dict[str, tuple[str, ...]]:
 
 
 def _take(vertex: Element, names: tuple[str, ...]) -> slice | list[int]:
-    """The columns of these properties: a slice where they stand together in order, which copies faster."""
+    """Columns of these properties, as a slice when they are contiguous, which copies faster."""
     place = {name: i for i, name in enumerate(vertex.names)}
     found = [place[name] for name in names]
     first = found[0] if found else 0
@@ -121,7 +121,7 @@ def _take(vertex: Element, names: tuple[str, ...]) -> slice | list[int]:
 
 
 def _bands(vertex: Element, path: Path) -> int:
-    """K - 1 of a vertex element that has all a splat needs, else InputError naming what is missing."""
+    """K - 1 of the vertex element; InputError names the properties that it lacks."""
     needed = (*_MEANS, *_SH0, "opacity", *_SCALES, *_QUATS)
     missing = [name for name in needed if name not in vertex.names]
     if missing:

@@ -1,4 +1,4 @@
-"""The header of a PLY file, parsed without trusting a word of it.
+"""Parses the untrusted header of a PLY file.
 
 Format: Greg Turk, "The PLY Polygon File Format" (1994): lines of text from `ply` to `end_header`, then the elements'
 rows in the order in which they were declared.
@@ -68,7 +68,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What the text part of a PLY file claims."""
+    """The text part of a PLY file."""
 
     byte_order: str
     """"<", ">" or "" for ascii."""

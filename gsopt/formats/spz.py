@@ -1,7 +1,7 @@
-"""Niantic's .spz: each attribute of all splats in a row, quantised to bytes and compressed as one gzip stream (2, 3) or
+"""Niantic's .spz: each attribute of all splats in a row, quantized to bytes and compressed as one gzip stream (2, 3) or
 as one Zstandard stream per attribute (4).
 
-Layout and quantisation: README and src/cc/load-spz.cc of github.com/nianticlabs/spz. Header: magic NGSP, version,
+Layout and quantization: README and src/cc/load-spz.cc of github.com/nianticlabs/spz. Header: magic NGSP, version,
 number of splats (uint32 each), SH degree, fractional bits, flags, and one byte that is 0 (2, 3) or the number of
 streams (4). Version 4 goes on with the offset of its table (uint32) and 12 zero bytes; the table holds a compressed and
 a plain size (uint64 each) per stream. The frame is right, up, back.
@@ -76,8 +76,8 @@ def save_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False, ver
 def load_spz(path: Path) -> Gaussians:
     """Read a .spz of version 2, 3 or (with the package `zstandard`) 4, SH degree 0 to 3.
 
-    Extensions are refused: they change what the numbers mean. A file that would unpack to far more than its own size
-    is refused before it is unpacked.
+    Extensions are refused because they change the meaning of the values. A file that would unpack to far more than its
+    own size is refused before it is unpacked.
     """
     with opened(path) as (file, size):
         read = _read_gzip if _is_gzip(file, path) else _read_zstandard
@@ -87,7 +87,7 @@ def load_spz(path: Path) -> Gaussians:
 
 
 def spz_antialiased(path: Path) -> bool:
-    """Whether the file says that its splats were optimised with the 2D filter of Mip-Splatting."""
+    """True when the file records that its splats were optimized with the 2D filter of Mip-Splatting."""
     with opened(path) as (file, _):
         if _is_gzip(file, path):
             data = GzipStream(file, path).take(_HEADER.size)

@@ -1,4 +1,4 @@
-"""The byte codes of .spz: what each attribute is rounded to, and back.
+"""Encoding of splat attributes as the byte codes of .spz, and decoding.
 
 Formulas: src/cc/load-spz.cc of github.com/nianticlabs/spz.
 """
@@ -24,7 +24,7 @@ _MAX_CODE = (1 << 23) - 1
 _FINEST = 16
 _COLOR_SCALE = 0.15
 _SH1_STEP, _SH_STEP = 8, 16
-"""Band 1 keeps 5 of 8 bits, bands 2 and 3 keep 4, as the format's own writer does: that is what makes it small."""
+"""Band 1 keeps 5 of 8 bits, bands 2 and 3 keep 4, as the format's own writer does, which makes the stream small."""
 _HALF = math.sqrt(0.5)
 _MAGNITUDE = 511
 
@@ -68,7 +68,7 @@ def _floats(codes: NDArray[np.uint8]) -> Tensor:
 
 
 def _fraction_bits(means: Float[Tensor, "N 3"], path: Path) -> int:
-    """As many bits after the point as 24 bits leave for the farthest splat."""
+    """Number of fraction bits that 24 bits leave for the farthest splat."""
     farthest = float(means.abs().max()) if means.numel() else 0.0
     bits = min(_FINEST, math.floor(math.log2(_MAX_CODE / farthest))) if farthest > 0 else _FINEST
     if bits < 0:
@@ -85,7 +85,7 @@ def _pack_positions(means: Float[Tensor, "N 3"], fraction_bits: int) -> NDArray[
 
 def _unpack_positions(codes: NDArray[np.uint8], fraction_bits: int) -> Float[Tensor, "N 3"]:
     wide = np.zeros((len(codes), 3, 4), np.uint8)
-    wide[:, :, 1:] = codes  # in the upper three bytes, so that shifting down repeats the sign
+    wide[:, :, 1:] = codes  # in the upper three bytes, so that the right shift extends the sign
     return torch.from_numpy((wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)) / (1 << fraction_bits)
 
 

@@ -1,4 +1,4 @@
-"""The one check every splat passes on its way in or out, and how a faulty element is named."""
+"""The check of all splats that are read or written, and conversions that keep values valid."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _TINY = torch.finfo(torch.float32).tiny
 _MAX_LOG = 87.0
 """exp(±87) are normal float32 numbers."""
 BYTE_OPACITY_MARGIN = 0.25 / 255
-"""How far a byte's opacities 0 and 255 are kept from 0 and 1: their logits are finite and round to the same byte."""
+"""Distance of the opacities of bytes 0 and 255 from 0 and 1: their logits are finite and round to the same byte."""
 
 
 def storable(gaussians: Gaussians, path: Path) -> Gaussians:
-    """The record as float32 on the CPU, detached, checked by `checked`; what every writer starts from."""
+    """The Gaussians as float32 on the CPU, detached and checked; every writer starts with them."""
     gaussians = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.items()})
     return checked(gaussians.to("cpu").to(torch.float32), path, "Nothing was written.")
 
 
 def checked(gaussians: Gaussians, path: Path, consequence: str = "Remove or repair that splat.") -> Gaussians:
-    """The same record, or InputError naming path, property and row of what is not finite or not a rotation."""
+    """The same Gaussians; InputError names path, property and row of a value that is not finite or no rotation."""
     _check_shapes(gaussians, path)
     for name, tensor in gaussians.items():
-        # A sum is finite unless an element is not, or it overflows, which the slow look at every element settles.
+        # Testing every element is slow: do it only when the sum is not finite, because of an element or an overflow.
         if tensor.numel() and not bool(torch.isfinite(tensor.sum())) and not bool(torch.isfinite(tensor).all()):
             row, *column = torch.nonzero(~torch.isfinite(tensor))[0].tolist()
             where = f"`{ply_name(name, column, gaussians.shN.shape[1])}` of row {row}"
@@ -71,12 +71,12 @@ def ply_name(parameter: str, index: list[int], bands: int) -> str:
 
 
 def logit(opacities: Tensor, quantum: float = 0.0) -> Tensor:
-    """ln(p / (1 - p)) of opacities in [0, 1], kept `quantum` away from the ends so that it stays finite."""
+    """ln(p / (1 - p)) of opacities in [0, 1], clamped to `quantum` from both ends, so that it is finite."""
     return torch.logit(opacities.double().clamp(quantum, 1.0 - quantum)).float()
 
 
 def scales(log_scales: Tensor) -> Tensor:
-    """exp(log_scales) held inside the range of a normal float32, so that its logarithm is finite again."""
+    """exp(log_scales), clamped to the normal float32 range, so that its logarithm is finite."""
     return log_scales.clamp(-_MAX_LOG, _MAX_LOG).exp()
 
 
@@ -86,5 +86,5 @@ def log_scales(scales: Tensor) -> Tensor:
 
 
 def to_bytes(values: Tensor) -> Tensor:
-    """Values rounded and held to 0..255."""
+    """Values rounded and clamped to 0..255."""
     return values.round().clamp(0, 255).to(torch.uint8)

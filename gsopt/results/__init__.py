@@ -1,1 +1,1 @@
-"""Everything after the last step: evaluation, report, viewer, renders and videos."""
+"""Everything after the last step of a run: evaluation, report, viewer, renders and videos."""

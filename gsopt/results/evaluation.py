@@ -1,4 +1,4 @@
-"""How good a run is on views it never saw: metrics.json and the held-out renders."""
+"""Evaluation of a run on its held-out views: metrics.json and renders."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from gsopt.raster.backend import Backend, RasterSettings
 from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
 from gsopt.results.video import safe_name, save_stills
 
-TRAIN_SAMPLE = 16
-"""With nothing held out, this many evenly spread input views are looked at."""
-DIGITS = 6
-"""Rounds off what depends on the number of torch's threads."""
+MAX_TRAIN_VIEWS = 16
+"""Input views to evaluate, evenly spread, when none is held out."""
+METRIC_DIGITS = 6
+"""Decimals of a metric; further ones depend on the number of torch's threads."""
 
 NO_TEST_VIEWS = (
-    "This run held out no views, so nothing can be said about new ones: metrics of training views are not reported as "
-    "held-out. They stand under `train`. Train with --eval to hold out every 8th image."
+    "This run held out no views, so its quality on new views is unknown: metrics of training views stand under `train` "
+    "and are not reported as held-out. Train with --eval to hold out every 8th image."
 )
 
 OnView = Callable[[int, int], None]
@@ -46,10 +46,10 @@ def evaluate_views(
     vgg: bool = True,
     on_view: OnView | None = None,
 ) -> dict[str, Any]:
-    """`{"mean": {psnr, ssim, lpips_alex, lpips_vgg}, "per_view": [{name, ..., render}]}`; each mean is over views.
+    """Returns `{"mean": {psnr, ssim, lpips_alex, lpips_vgg}, "per_view": [{name, ..., render}]}`.
 
-    Renders and truths are rounded to 8 bit first. A value that cannot be had (no VGG weights, image too small for the
-    network) is None, and so is its mean. `render` is the PNG's name in `save_dir`. `on_view(done, total)` follows.
+    Renders and truths are rounded to 8 bit first. A value that cannot be computed (no VGG weights, image too small for
+    the network) is None, and so is its mean. `render` is the PNG's name in `save_dir`; `on_view(done, total)` reports.
     """
     networks = _networks(vgg)
     per_view: list[dict[str, Any]] = []
@@ -78,16 +78,16 @@ def _image_metrics(
     for name, network in networks.items():
         usable = network is not None and network.fits(*picture.shape[:2])
         values[name] = network(a, b).item() if network is not None and usable else None
-    return {name: None if value is None else round(value, DIGITS) for name, value in values.items()}
+    return {name: None if value is None else round(value, METRIC_DIGITS) for name, value in values.items()}
 
 
 def _mean(per_view: list[dict[str, Any]]) -> dict[str, float | None] | None:
-    """Mean of each metric over views; None for one that some view lacks, and None as a whole without views."""
+    """Mean of each metric over views, None for a metric that some view lacks; None without views."""
     if not per_view:
         return None
     columns = {key: [row[key] for row in per_view] for key in ("psnr", "ssim", "lpips_alex", "lpips_vgg")}
     return {
-        key: None if any(value is None for value in column) else round(sum(column) / len(column), DIGITS)
+        key: None if any(value is None for value in column) else round(sum(column) / len(column), METRIC_DIGITS)
         for key, column in columns.items()
     }
 
@@ -102,14 +102,14 @@ def evaluate(
     scene: Scene | None = None,
     on_view: OnView | None = None,
 ) -> dict[str, Any]:
-    """Judge a finished run by its held-out views and write metrics.json; other fields in there are kept.
+    """Evaluates a finished run on its held-out views and writes metrics.json, whose other fields are kept.
 
-    `scene` saves loading it again. With nothing held out `mean` is null, `reason` says why, and some input views are
-    judged under `train`, where the run put them if it refined poses. Renders go to RUN/renders/{test,train}. Raises
+    `scene` saves loading it again. With nothing held out `mean` is null, `reason` explains it, and some input views are
+    evaluated under `train`, at their refined poses if the run has any. Renders go to RUN/renders/{test,train}. Raises
     InputError when run or data cannot be read.
     """
     finished = open_run(Path(run), backend, threads)
-    kept = read_metrics(finished.path)  # before the work: a broken file is not to be replaced
+    kept = read_metrics(finished.path)  # before the work, so that a broken file is not replaced
     scene = with_refined_poses(scene or load_scene(finished.config.data), finished.path)
     results = _results(finished, scene, vgg, on_view)
     document = {**kept, **_about(finished), **results, "protocol": _protocol(finished, scene, results)}
@@ -118,7 +118,7 @@ def evaluate(
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
-    """What metrics.json holds, {} when there is none; InputError when it cannot be understood."""
+    """Content of metrics.json, {} without the file; InputError when it cannot be parsed."""
     path = run / "metrics.json"
     if not path.exists():
         return {}
@@ -133,7 +133,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 
 def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | None) -> dict[str, Any]:
-    split, views = ("test", scene.test) if scene.test else ("train", _spread(scene.train, TRAIN_SAMPLE))
+    split, views = ("test", scene.test) if scene.test else ("train", _spread(scene.train, MAX_TRAIN_VIEWS))
     evaluated = evaluate_views(
         finished.gaussians,
         views,
@@ -159,7 +159,7 @@ def _spread(views: Sequence[View], count: int) -> list[View]:
 
 
 def _about(finished: FinishedRun) -> dict[str, Any]:
-    """What the figures belong to."""
+    """Facts about the run that accompany its metrics."""
     recorded = json.loads((finished.path / "config.json").read_bytes())
     about = {
         "n_gaussians": len(finished.gaussians),
@@ -170,15 +170,15 @@ def _about(finished: FinishedRun) -> dict[str, Any]:
 
 
 def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> str:
-    """How the figures came about, in words that can stand under a table."""
+    """The evaluation protocol, as a note below a table."""
     evaluated = len(results["per_view"]) or len(results["train"]["per_view"])
     background = {"random": "white (trained on random)"}.get(finished.config.data.background)
     return (
         "PSNR per image then mean; SSIM 11x11 sigma 1.5 zero padding; LPIPS v0.1 Alex and VGG, inputs mapped to [-1,1] "
         "(the Inria code feeds VGG [0,1] unscaled, which gives other values); renders and truths rounded to 8 bit as "
         f"the field does; equal images count as {PSNR_CAP:g} dB; background "
-        f"{background or finished.config.data.background}; split: learned from {len(scene.train)} views, held out "
-        f"{len(scene.test)}, judged {evaluated} {'held-out' if scene.test else 'training'} views; images "
+        f"{background or finished.config.data.background}; split: trained on {len(scene.train)} views, held out "
+        f"{len(scene.test)}, evaluated on {evaluated} {'held-out' if scene.test else 'training'} views; images "
         f"{_sizes(scene.test or scene.train)}; gsopt {__version__}, torch {torch.__version__}, "
         f"backend {finished.backend.name}."
     )

@@ -1,4 +1,4 @@
-"""A finished run, drawn again: cameras in, 8-bit pictures out."""
+"""A finished run and its renders: cameras in, 8-bit images out."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NamedCamera = tuple[str, Cameras]
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a run directory holds, ready to be drawn."""
+    """The splats and settings of a run directory, ready to render."""
 
     path: Path
     config: TrainConfig
@@ -38,7 +38,7 @@ class FinishedRun:
     background: Float[Tensor, "3"]
 
     def draw(self, camera: Cameras) -> UInt8[Tensor, "H W 3"]:
-        """One camera's picture on the run's background."""
+        """The render of one camera on the run's background."""
         return draw(self.gaussians, camera, self.backend, self.settings, self.background)
 
 
@@ -68,7 +68,7 @@ def open_run(run: Path, backend: str | None = None, threads: int | None = None) 
 def draw(
     gaussians: Gaussians, camera: Cameras, backend: Backend, settings: RasterSettings, background: Float[Tensor, "3"]
 ) -> UInt8[Tensor, "H W 3"]:
-    """One camera's picture, clamped to 0..1 and rounded to 8 bit."""
+    """The render of one camera, clamped to 0..1 and rounded to 8 bit."""
     camera = camera.to(gaussians.means.dtype)
     return to_bytes(backend.forward(gaussians, camera, settings, background.to(gaussians.means)).colors)
 
@@ -87,22 +87,22 @@ def to_bytes(colors: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
 
 
 def cameras_along(run: FinishedRun, path: str, count: int, longest: int | None = None) -> list[NamedCamera]:
-    """What to draw for `--path`: the input or held-out views themselves, or `count` cameras on a film's path.
+    """Cameras of `--path`: the input or held-out views themselves, or `count` cameras along a path.
 
-    `longest`: scale so that the longer side has this many px. Raises InputError when nothing was held out.
+    `longest`: length of the longer side after scaling, px. Raises InputError when nothing was held out.
     """
     scene = with_refined_poses(load_scene(run.config.data), run.path)
     if path in ("train", "test"):
         views = scene.train if path == "train" else scene.test
         if not views:
             raise InputError(
-                f"{run.path} held out no views to draw, got 0. Choose another --path, or train with --eval."
+                f"{run.path} held out no views to render, got 0. Choose another --path, or train with --eval."
             )
         shots = [(safe_name(index, view.name), view.camera) for index, view in enumerate(views)]
     else:
         cameras = Cameras.cat([view.camera.resized(*_first_size(scene)) for view in scene.train])
-        film = camera_path(run, cameras, path, count)
-        shots = [(f"{index:04d}", film[index]) for index in range(len(film))]
+        path_cameras = camera_path(run, cameras, path, count)
+        shots = [(f"{index:04d}", path_cameras[index]) for index in range(len(path_cameras))]
     return [(name, camera if longest is None else with_longest_side(camera, longest)) for name, camera in shots]
 
 
@@ -115,7 +115,7 @@ def camera_path(run: FinishedRun, cameras: Cameras, path: str, count: int) -> Ca
 
 
 def look_at_point(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"] | None:
-    """Where a film should look when the cameras do not say: for one camera, the median of the more opaque half."""
+    """Target of a path around a single camera: the median of the more opaque half of the Gaussians."""
     if len(cameras) > 1 or len(gaussians) == 0:
         return None
     solid = gaussians.means[gaussians.opacities >= gaussians.opacities.median()]
@@ -129,14 +129,14 @@ def with_longest_side(camera: Cameras, longest: int) -> Cameras:
 
 
 def render_stills(run: FinishedRun, shots: list[NamedCamera], folder: Path, *, overwrite: bool = False) -> None:
-    """PNG frames in a folder."""
+    """Writes PNG frames into a folder."""
     save_stills(folder, ((name, run.draw(camera)) for name, camera in shots), overwrite=overwrite)
 
 
 def render_video(
     run: FinishedRun, shots: list[NamedCamera], output: Path, fps: float, *, overwrite: bool = False
 ) -> None:
-    """A film; its format is the suffix of `output`."""
+    """Writes a video in the format that the suffix of `output` names."""
     save_video(output, (run.draw(camera) for _, camera in shots), fps, overwrite=overwrite)
 
 

@@ -1,4 +1,4 @@
-"""Pictures to files: PNG frames in a folder, or a film as MP4, WebP or GIF."""
+"""Renders to files: PNG frames in a folder, or a video as MP4, WebP or GIF."""
 
 from __future__ import annotations
 
@@ -20,16 +20,14 @@ from gsopt.formats.files import replacing
 VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
 WEBP_QUALITY = 85
 MAX_SIDE = {".webp": 16383, ".gif": 65535, ".mp4": 8192}
-"""What the formats (WebP, GIF) or common decoders (H.264) can hold, px."""
+"""Longest side that the format (WebP, GIF) or common decoders (H.264) support, px."""
 
 
-def save_video(
-    output: Path, pictures: Iterable[UInt8[Tensor, "H W 3"]], fps: float, *, overwrite: bool = False
-) -> None:
-    """Write a film whose format the suffix of `output` names; whole file or nothing.
+def save_video(output: Path, renders: Iterable[UInt8[Tensor, "H W 3"]], fps: float, *, overwrite: bool = False) -> None:
+    """Writes a video in the format that the suffix of `output` names; whole file or nothing.
 
-    Raises UsageError when the file exists and `overwrite` is not set, InputError for pictures of different sizes,
-    MissingDependency when MP4 is asked for without the package `av`.
+    Raises UsageError when the file exists and `overwrite` is not set, InputError for images of different sizes,
+    MissingDependency for MP4 without the package `av`.
     """
     kind = output.suffix.lower()
     check.one_of("suffix of --output", kind, VIDEO_SUFFIXES)
@@ -37,8 +35,8 @@ def save_video(
     if output.exists() and not overwrite:
         raise UsageError(f"{output} exists already. Add --overwrite to replace it, or name another file.")
     if kind == ".mp4":
-        require("av", "video", "Writing an MP4 film")
-    images = _same_size(pictures, MAX_SIDE[kind])
+        require("av", "video", "Writing an MP4 video")
+    images = _same_size(renders, MAX_SIDE[kind])
     first = next(images)
     with replacing(output) as file:
         write_video(file, itertools.chain([first], images), kind, fps)
@@ -50,7 +48,7 @@ def write_video(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: f
         _write_mp4(file, images, fps)
         return
     first = next(images)
-    # GIF counts in hundredths of a second, and players slow down what is shorter than two of them.
+    # GIF counts in hundredths of a second, and players slow down frames shorter than two of them.
     duration = round(1000 / fps) if kind == ".webp" else max(20, 10 * round(100 / fps))
     options = {"quality": WEBP_QUALITY, "method": 4} if kind == ".webp" else {"optimize": False}
     first.save(
@@ -65,7 +63,7 @@ def write_video(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: f
 
 
 def _write_mp4(file: BinaryIO, images: Iterator[Image.Image], fps: float) -> None:
-    av = require("av", "video", "Writing an MP4 film")
+    av = require("av", "video", "Writing an MP4 video")
     with av.open(file, "w", format="mp4") as container:
         stream = None
         for image in images:
@@ -81,9 +79,9 @@ def _write_mp4(file: BinaryIO, images: Iterator[Image.Image], fps: float) -> Non
 
 
 def save_stills(
-    folder: Path, pictures: Iterable[tuple[str, UInt8[Tensor, "H W 3"]]], *, overwrite: bool = False
+    folder: Path, renders: Iterable[tuple[str, UInt8[Tensor, "H W 3"]]], *, overwrite: bool = False
 ) -> list[Path]:
-    """Write each picture as FOLDER/NAME.png and return the paths. The names must be safe (see `safe_name`).
+    """Writes each image as FOLDER/NAME.png and returns the paths. The names must be safe (see `safe_name`).
 
     Raises UsageError before writing over a file, unless `overwrite` is set; InputError when the disk refuses.
     """
@@ -92,40 +90,40 @@ def save_stills(
     except OSError as error:
         raise InputError(f"Cannot make the folder {folder}: {error.strerror}. Choose another one.") from error
     written: list[Path] = []
-    for name, picture in pictures:
+    for name, render in renders:
         path = folder / f"{name}.png"
         if path.exists() and not overwrite:
             raise UsageError(f"{path} exists already. Add --overwrite to replace it, or name another folder.")
         with replacing(path) as file:
-            as_image(picture).save(file, format="PNG")
+            as_image(render).save(file, format="PNG")
         written.append(path)
     return written
 
 
 def safe_name(index: int, name: str) -> str:
-    """A file name that sorts by index, keeps what is harmless of a view's name and never leads out of a folder."""
+    """A file name that sorts by index, keeps the harmless characters of a view's name and never leaves its folder."""
     stem = Path(name.replace("\\", "/")).stem
     harmless = "".join(letter if letter.isascii() and (letter.isalnum() or letter in "-_") else "_" for letter in stem)
     return f"{index:04d}_{harmless[:60]}"
 
 
-def as_image(picture: UInt8[Tensor, "H W 3"]) -> Image.Image:
-    return Image.fromarray(picture.contiguous().numpy())
+def as_image(render: UInt8[Tensor, "H W 3"]) -> Image.Image:
+    return Image.fromarray(render.contiguous().numpy())
 
 
-def _same_size(pictures: Iterable[Tensor], largest: int) -> Iterator[Image.Image]:
+def _same_size(renders: Iterable[Tensor], largest: int) -> Iterator[Image.Image]:
     """Images one by one; InputError at the first of another size, or when there is none."""
     size: tuple[int, int] | None = None
-    for picture in pictures:
-        image = as_image(picture)
+    for render in renders:
+        image = as_image(render)
         size = size or image.size
         if image.size != size:
             got = f"{image.width}x{image.height} after {size[0]}x{size[1]}"
-            raise InputError(f"All frames of a film must have one size, got {got}. Write PNG frames instead.")
+            raise InputError(f"All frames of a video must have one size, got {got}. Write PNG frames instead.")
         if max(size) > largest:
             raise InputError(
                 f"This format holds at most {largest} px a side, got {max(size)}. Write PNG frames instead."
             )
         yield image
     if size is None:
-        raise InputError("A film needs at least one frame, got none. Give a path with cameras on it.")
+        raise InputError("A video needs at least one frame, got none. Give a path with cameras on it.")

@@ -1,4 +1,4 @@
-"""The web viewer: splats of a run or a file, the input cameras, and each new preview while the run goes on."""
+"""The web viewer: splats of a run or a file, the input cameras, and each new preview of a running training."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ from gsopt.raster.reference import covariances
 POLL_SECONDS = 0.5
 FRUSTUM_SIZE = 0.05
 """Length of a drawn camera as a fraction of the scene's radius."""
-HALF_MAX = 6e4
-"""Covariances travel to the browser as half floats; this is just below their largest value."""
+MAX_COVARIANCE = 6e4
+"""Just below the largest half float, the format of covariances in the browser."""
 
 
 @dataclass(frozen=True)
 class Update:
-    """Something new to show."""
+    """A change to display."""
 
     splats: Path | None
-    """File to load; None when the event is only text."""
+    """File to load, or None when the event is only text."""
     caption: str
 
 
 class RunFollower:
-    """Reads a run's events as they come and says which splats are the newest."""
+    """Reads a run's new events and returns its newest splats."""
 
     def __init__(self, run: Path) -> None:
         self.run = run
         self._offset = 0
 
     def poll(self) -> Update | None:
-        """The newest update since the last call, or None. Older previews in between are passed over."""
+        """The newest update since the last call, or None; older previews are skipped."""
         events, self._offset = read_events(self.run / "events.jsonl", self._offset)
         updates = [update for event in events if (update := self._update(event)) is not None]
         drawn = [update for update in updates if update.splats is not None]
@@ -67,7 +67,7 @@ class RunFollower:
         return None
 
     def _inside(self, name: object) -> Path | None:
-        """The file `name` of the run; None when it is absent or leads out of the run directory."""
+        """The file `name` of the run, or None when it is missing or outside the run directory."""
         if not isinstance(name, str):
             return None
         path = (self.run / name).resolve()
@@ -87,13 +87,13 @@ class SplatViewer:
 
     @property
     def port(self) -> int:
-        """The port in use: the next free one where the asked one was taken."""
+        """The port in use: the next free one when the requested port was taken."""
         port: int = self._server.get_port()
         return port
 
     def show_splats(self, gaussians: Gaussians, caption: str) -> None:
-        """Replace what is shown. Colors are the base ones: the browser's renderer knows no spherical harmonics."""
-        sigma = covariances(gaussians.quats, gaussians.log_scales).clamp(-HALF_MAX, HALF_MAX)
+        """Replaces the splats. Colors are those of SH degree 0: the browser's renderer supports no other bands."""
+        sigma = covariances(gaussians.quats, gaussians.log_scales).clamp(-MAX_COVARIANCE, MAX_COVARIANCE)
         self._server.scene.add_gaussian_splats(
             "/splats",
             centers=gaussians.means.numpy(),
@@ -104,7 +104,7 @@ class SplatViewer:
         self._caption.content = f"{caption}: {len(gaussians)} Gaussians"
 
     def show_cameras(self, cameras: list[Cameras], radius: float) -> None:
-        """A frustum per camera, its up turned to the screen's; `radius` of the scene sets their size."""
+        """Adds a frustum per camera and turns their mean up axis up; `radius` of the scene sets their size."""
         self._server.scene.set_up_direction(tuple(mean_up(cameras).tolist()))
         for i, camera in enumerate(cameras):
             world_from_cam = torch.linalg.inv(camera.viewmats[0].double())
@@ -119,7 +119,7 @@ class SplatViewer:
             )
 
     def look_from(self, eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> None:
-        """Where a browser that connects starts."""
+        """Sets the initial camera of browsers that connect."""
         self._server.initial_camera.position = tuple(eye.tolist())
         self._server.initial_camera.look_at = tuple(target.tolist())
 
@@ -138,7 +138,7 @@ def mean_up(cameras: list[Cameras]) -> Float[Tensor, "3"]:
     return up / up.norm() if up.norm() > 1e-3 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-def extent(means: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "3"], float]:
+def center_and_radius(means: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "3"], float]:
     """Median and a robust radius (90th percentile of the distance to it, scene units) of points."""
     if len(means) == 0:
         return torch.zeros(3), 1.0
@@ -148,20 +148,20 @@ def extent(means: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "3"], float]:
 
 
 def input_cameras(run: Path) -> list[Cameras]:
-    """The cameras a run learned from. Raises InputError when its dataset is gone."""
+    """The input cameras of a run. Raises InputError when its dataset is gone."""
     return [view.camera for view in load_scene(TrainConfig.read(run / "config.json").data).train]
 
 
 def view_file(viewer: SplatViewer, path: Path) -> None:
     """Show one splat file."""
     gaussians = load_splats(path)
-    center, radius = extent(gaussians.means)
+    center, radius = center_and_radius(gaussians.means)
     viewer.show_splats(gaussians, path.name)
     viewer.look_from(center + radius * torch.tensor([2.0, 2.0, 1.0]), center)
 
 
 def view_run(viewer: SplatViewer, run: Path) -> Iterator[str]:
-    """Show a run and follow it: yields a line for each thing shown, or "" when there was nothing new; never ends."""
+    """Shows a run and follows it without end; yields a line per update, or "" when nothing is new."""
     follower = RunFollower(run)
     cameras, notice = cameras_or_notice(run)
     if notice:
@@ -179,7 +179,7 @@ def view_run(viewer: SplatViewer, run: Path) -> Iterator[str]:
 
 
 def cameras_or_notice(run: Path) -> tuple[list[Cameras], str]:
-    """The input cameras, or none and the reason: a run stays viewable when its photos have moved."""
+    """(input cameras, ""), or ([], reason), so that a run can be viewed after its photos have moved."""
     try:
         return input_cameras(run), ""
     except (InputError, UsageError) as error:
@@ -188,18 +188,18 @@ def cameras_or_notice(run: Path) -> tuple[list[Cameras], str]:
 
 def frame_run(viewer: SplatViewer, gaussians: Gaussians, cameras: list[Cameras]) -> None:
     """Place the browser's camera, and the frusta where there are any."""
-    center, radius = extent(gaussians.means)
+    center, radius = center_and_radius(gaussians.means)
     eye = center + radius * torch.tensor([2.0, 2.0, 1.0])
     if cameras:
         viewer.show_cameras(cameras, radius)
-        # Behind and above the first camera, so that its own frustum does not stand in the way.
+        # Behind and above the first camera, so that its own frustum does not cover the view.
         first = cameras[0].centers[0].float()
         eye = first + 0.25 * (first - center) + 0.25 * (first - center).norm() * mean_up(cameras).float()
     viewer.look_from(eye, center)
 
 
 def serve(target: Path, host: str, port: int, once: bool) -> None:
-    """Show `target` until interrupted; `once` returns after what is there has been shown.
+    """Shows `target` until interrupted; with `once`, returns after the first update.
 
     Raises InputError when `target` is neither a run directory nor a splat file.
     """
@@ -224,7 +224,7 @@ def serve(target: Path, host: str, port: int, once: bool) -> None:
 
 
 def follow(lines: Iterator[str], once: bool) -> None:
-    """Print what `view_run` shows; `once` ends at the first time there is nothing new."""
+    """Prints the lines of `view_run`; with `once`, returns when nothing is new."""
     for line in lines:
         if line:
             print(line, flush=True)

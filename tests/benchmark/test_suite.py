@@ -277,15 +277,15 @@ def test_tables_come_from_the_file_alone(tmp_path: Path) -> None:
     assert "old" not in text
     assert "| 3dgs, 2,000 | 2 | 22.50 | 0.5000 |" in text
     # Differences +0.5 and +2.5: mean 1.5, error 1, t(1) = 12.706; -0.5 and +1.5 against ours-0.
-    assert "| ours, 2,000 less 3dgs, 2,000 | 2 | +1.50 ± 12.71 |" in text
-    assert "| ours, 2,000 less ours-0, 2,000 | 2 | +0.50 ± 12.71 |" in text
+    assert "| ours, 2,000 minus 3dgs, 2,000 | 2 | +1.50 ± 12.71 |" in text
+    assert "| ours, 2,000 minus ours-0, 2,000 | 2 | +0.50 ± 12.71 |" in text
     assert "| -0.50 | 1 of 2 |" in text
     assert "| oakChair | 20.00 | 21.00 | 20.50 | 0.5 |" in text
     assert "Not run yet: objects-4, 4 views, seed 0" in text
     shown = {line.split("(img/")[1].rstrip(")") for line in text.splitlines() if line.startswith("![")}
     assert shown == {path.name for path in (tmp_path / "img").iterdir()}
     html = (tmp_path / "results-sparse.html").read_text()
-    assert "ours, 2,000 less 3dgs, 2,000" in html
+    assert "ours, 2,000 minus 3dgs, 2,000" in html
     assert page_of(document(*runs), tmp_path) == text
 
 
@@ -304,7 +304,7 @@ def test_an_arm_that_lacks_scenes_does_not_narrow_the_others() -> None:
     note, (_, rows) = made.tables[0]
     assert [row[:3] for row in rows] == [["3dgs, 2,000", "2", "20.00"], ["ours-0, 2,000", "2", "21.00"]]
     assert "ours-llm" in note
-    assert any(row[0].startswith("ours-llm, 2,000 less") and row[1] == "1" for row in made.tables[1][1][1])
+    assert any(row[0].startswith("ours-llm, 2,000 minus") and row[1] == "1" for row in made.tables[1][1][1])
 
 
 def test_rows_of_scenes_are_of_the_seeds_that_all_arms_have(tmp_path: Path) -> None:

@@ -293,7 +293,7 @@ def published(folder: Path, count: int) -> Path:
     return folder
 
 
-def test_the_published_layout_is_trained_and_judged_by_every_eighth_image(tmp_path: Path) -> None:
+def test_the_published_layout_is_trained_and_evaluated_on_every_eighth_image(tmp_path: Path) -> None:
     published(tmp_path / "root" / "tandt" / "train", 10)
     case = next(definition.cases(definition.load("paper"), 1))
     assert case.scene == "tandt/train"
@@ -305,5 +305,5 @@ def test_the_published_layout_is_trained_and_judged_by_every_eighth_image(tmp_pa
     assert made["views_out"] == ["images/00000.jpg", "images/00008.jpg"]
     assert made["per_view"]["mask_iou"] == [None, None]
     assert made["n_gaussians"] == 12 * 40
-    assert "split: learned from 8 views, held out 2" in protocol
+    assert "split: trained on 8 views, held out 2" in protocol
     assert "not guided" in (single_run.reason_to_skip(replace(case, arm="ours"), context) or "")

@@ -78,7 +78,7 @@ def test_the_values_are_activated_and_left_up_forward(tmp_path: Path) -> None:
     torch.testing.assert_close(read(f"{EXTENSION}:SH_DEGREE_3_COEF_3"), splats.shN[:, 11])  # odd in z
 
 
-def test_interleaved_and_quantised_accessors_read_the_same(tmp_path: Path) -> None:
+def test_interleaved_and_quantized_accessors_read_the_same(tmp_path: Path) -> None:
     splats = make_splats(6, degree=0)
     save_splats(tmp_path / "a.glb", splats)
     document, binary = parse(tmp_path / "a.glb")

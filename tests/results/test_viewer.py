@@ -168,8 +168,8 @@ def test_splats_are_sent_after_activation(recorder: Recorder) -> None:
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_the_extent_of_any_number_of_points_is_positive_and_moves_with_them(n: int) -> None:
     points = gaussians(n).means
-    center, radius = viewer.extent(points)
-    moved_center, moved_radius = viewer.extent(points + 10)
+    center, radius = viewer.center_and_radius(points)
+    moved_center, moved_radius = viewer.center_and_radius(points + 10)
     assert radius > 0
     assert moved_radius == pytest.approx(radius, rel=1e-4)
     if n:

@@ -7,7 +7,6 @@ import io
 import re
 from collections.abc import Sequence
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ from gsopt.benchmark.suite.aggregate import Variant
 from gsopt.benchmark.suite.tables import GroupSection, about, group_sections, missing
 from gsopt.errors import InputError
 from gsopt.events import write_atomic
+from gsopt.results.report.page import html_document
 
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 STYLE = (
     ".grid{border-spacing:6px;border-collapse:separate}.grid td{padding:0;vertical-align:top;text-align:center}"
     ".grid img{display:block;width:150px;height:auto}.grid td.none{color:#888}svg{max-width:540px;height:auto}"
@@ -37,19 +36,16 @@ def write_html(document: dict[str, Any], pictures: dict[str, Any], path: Path) -
 
 def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
     suite = declared.of_document(document)
-    style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
     lines = "".join(f"<p>{marked(line)}</p>" for line in about(document))
     sections = "".join(section(made, pictures) for made in group_sections(document))
     rest = "".join(f"<li>{marked(line)}</li>" for line in missing(document))
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
-        f'content="light dark"><link rel="icon" href="data:,"><title>{escape(suite.title)} · gsopt bench</title>'
-        f"<style>\n{style}{STYLE}</style></head>\n<body><main><header><p class='eyebrow'>gsopt bench --suite "
-        f"{escape(suite.name)}</p><h1>{escape(suite.title)}</h1></header>{lines}{sections}"
-        f"<section><h2>What is missing</h2><ul>{rest or '<li>Nothing.</li>'}</ul></section></main>"
-        f"<footer><p>gsopt {__version__}</p></footer></body></html>\n"
+    return html_document(
+        f"{suite.title} · gsopt bench",
+        f"<main><header><p class='eyebrow'>gsopt bench --suite {escape(suite.name)}</p>"
+        f"<h1>{escape(suite.title)}</h1></header>{lines}{sections}"
+        f"<section><h2>Missing runs</h2><ul>{rest or '<li>None.</li>'}</ul></section></main>"
+        f"<footer><p>gsopt {__version__}</p></footer>",
+        STYLE,
     )
 
 
@@ -77,8 +73,8 @@ def grid(made: GroupSection, pictures: dict[str, Any]) -> str:
         return ""
     names = "".join(f"<th>{escape(arm)}<br>{steps:,}</th>" for arm, steps in made.variants)
     note = (
-        "The held-out view that stands farthest from all input views, chosen before any result, and the input view "
-        "nearest to it; below each render its error (dark: none, bright: a quarter of the range and more). Seed 0."
+        "The held-out view farthest from all input views, chosen before any result, and the input view nearest to "
+        "it; below each render its error (dark: none, bright: a quarter of the range and more). Seed 0."
     )
     head = f"<tr><th></th><th>nearest input</th>{names}<th>truth</th></tr>"
     return f"<p class='muted'>{note}</p><div class='scroll'><table class='grid'>{head}{rows}</table></div>"
@@ -150,4 +146,4 @@ def decoded(uri: str) -> Image.Image:
         ) as image:
             return image.convert("RGB")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"A picture of the suite cannot be read: {error}. Make its runs again.") from error
+        raise InputError(f"An image of the suite cannot be read: {error}. Execute its runs again.") from error

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsopt.benchmark.scenes import time_at
 from gsopt.data.scene import Scene, View
 from gsopt.formats import load_splats
-from gsopt.results.evaluation import DIGITS, evaluate_views
+from gsopt.results.evaluation import METRIC_DIGITS, evaluate_views
 from gsopt.results.finished_run import FinishedRun, truth
 from gsopt.results.report.embedded_images import data_uri, error_map, shrunk
 from gsopt.results.video import as_image
@@ -71,13 +71,13 @@ def _shape_of(finished: FinishedRun, scene: Scene, view: View) -> tuple[float | 
     if not bool(both.any()):
         return iou, None
     error = (frame.depths[both] / frame.alphas[both] - depth[both]).abs().double().mean()
-    return iou, round(float(error), DIGITS)
+    return iou, round(float(error), METRIC_DIGITS)
 
 
 def overlap(a: Tensor, b: Tensor) -> float:
     """Intersection over union of two masks; 1 where both are empty."""
     union = int((a | b).sum())
-    return round(int((a & b).sum()) / union, DIGITS) if union else 1.0
+    return round(int((a & b).sum()) / union, METRIC_DIGITS) if union else 1.0
 
 
 def read_depth(root: Path, view: View) -> Float[Tensor, "H W"] | None:

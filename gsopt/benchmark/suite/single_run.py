@@ -72,11 +72,11 @@ def _reason_without_prompts(case: Case, context: SuiteContext, prior: str) -> st
     from gsopt.sds.load_prior import open_prior
 
     if open_prior(prior, GuidanceConfig(prior=prior)).encoder() is None:
-        return f"the prior {prior} takes no words: prompts cannot change anything"
+        return f"the prior {prior} has no text encoder: prompts cannot change anything"
     if case.arm == "ours-llm" and not context.llm:
-        return "no language model named: --llm URL"
+        return "no language model given: --llm URL"
     if case.scene not in notes(context.root):
-        return f"no words for {case.scene} in notes.json below the root"
+        return f"no notes for {case.scene} in notes.json below the root"
     return None
 
 
@@ -169,7 +169,7 @@ def call(arguments: list[str], log: Path) -> None:
         last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-MAX_ERROR_LINES:]
         raise RunFailed(
             f"`gsopt {' '.join(arguments)}` ended with exit code {done.returncode}: {' / '.join(last)}. "
-            "Mend that and call the suite again: it makes only what is missing."
+            "Correct that and run the suite again: it executes only missing runs."
         )
 
 
@@ -191,7 +191,7 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
 
     metrics, events = read_metrics(run), read_events(run / "events.jsonl")[0]
     if events[-1]["kind"] != "done":
-        raise RunFailed(f"{case.id} must end with `done`, got {events[-1]['kind']!r}. Call the suite again.")
+        raise RunFailed(f"{case.id} must end with `done`, got {events[-1]['kind']!r}. Run the suite again.")
     if not metrics.get("per_view"):
         raise InputError(f"{case.scene} holds out no views, so nothing can be evaluated. Add --eval to its group.")
     finished = open_run(run, threads=context.threads)

@@ -69,9 +69,11 @@ def group_section(suite: Suite, group: Group, views: str, runs: list[Run]) -> Gr
     made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, {which}.")
     whole = aggregate.complete(runs, variants)
     same = aggregate.common(runs, whole)
-    note = "Means over scenes, seeds averaged first; " + ("what every arm has." if same else "arms differ in scenes.")
+    note = "Means over scenes, seeds averaged first; " + (
+        "only runs that every arm has." if same else "arms differ in scenes."
+    )
     if lacking := [_name(one) for one in variants if one not in whole] if same else []:
-        note += f" Not of {', '.join(lacking)}, where scenes or seeds are missing."
+        note += f" Without {', '.join(lacking)}: scenes or seeds are missing."
     made.tables.append((note, figures(same or runs, whole if same else variants)))
     pairs = list(comparisons(group, variants))
     if rows := [row for a, b in pairs if (row := compared(runs, a, b))]:
@@ -79,9 +81,9 @@ def group_section(suite: Suite, group: Group, views: str, runs: list[Run]) -> Gr
         head = ["paired difference", what, *(f"Δ {METRICS[m][0]}" for m in COMPARED), "PSNR worst", "PSNR better in"]
         made.tables.append(("Mean with its 95 % confidence interval (Student's t); losses included.", (head, rows)))
     if len(variants) > 1 and (rows := [row for a in variants if (row := time_row(runs, a, variants[0]))]):
-        note = f"CPU seconds until a run is as good as {_name(variants[0])} ends on the same scene (PSNR of "
-        note += f"{max(run['curve_views'] for run in runs)} held-out views, looked at {declared.EVALUATIONS} times)."
-        made.tables.append((note, (["arm", "median of those that get there", "get there", "whole run, median"], rows)))
+        note = f"CPU seconds until a run reaches the final PSNR of {_name(variants[0])} on the same scene (mean of "
+        note += f"{max(run['curve_views'] for run in runs)} held-out views, evaluated {declared.EVALUATIONS} times)."
+        made.tables.append((note, (["arm", "median of the runs that reach it", "reach it", "whole run, median"], rows)))
     if len(made.scenes) > 1:
         made.tables.append(("PSNR of every scene.", scene_rows(runs, made.scenes, variants)))
     made.charts = charts(f"suite-{suite.name}-{group.name}" + (f"-{view_count(views)}" if several else ""), made, runs)
@@ -130,7 +132,7 @@ def compared(runs: Sequence[Run], a: Variant, b: Variant) -> list[str]:
     psnr = found["psnr"]
     if psnr is None:
         return []
-    row = [f"{_name(a)} less {_name(b)}", str(psnr.count)]
+    row = [f"{_name(a)} minus {_name(b)}", str(psnr.count)]
     row += [_interval(found[m], METRICS[m][1]) for m in COMPARED]
     return [*row, f"{psnr.lowest:+.2f}", f"{psnr.positive} of {psnr.count}"]
 
@@ -183,12 +185,12 @@ def about(document: dict[str, Any]) -> list[str]:
     """Origin and protocol of the figures."""
     places = [f"{m['cpu']}, {m['cores']} cores, gsopt {m['commit'] or m['gsopt']}" for m in document["machines"]]
     codes = Counter(run["code"] for run in document["runs"])
-    mixed = "" if len(codes) < 2 else f" The runs are of {len(codes)} versions of the code: call the suite again."
+    mixed = "" if len(codes) < 2 else f" The runs are of {len(codes)} versions of the code: run the suite again."
     suite = declared.of_document(document)
     lines = [suite.about.replace("\n", " "), f"`{document['command']}` on {'; '.join(places)}.{mixed}"]
     lines.append(
         "CPU seconds of all threads: reading, first Gaussians, the guard's short runs and the steps; other work on the "
-        "machine slows them by sharing caches, but does not add to them."
+        "machine slows them through shared caches, but does not add to them."
     )
     if document["protocols"]:
         lines.append("Protocol: " + document["protocols"][0].partition("; background")[0] + ".")

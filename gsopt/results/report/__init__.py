@@ -1,4 +1,4 @@
-"""One self-contained page about a run: report.html needs no network and no other file."""
+"""report.html: one self-contained page about a run, without network or other files."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["write_report"]
 
 
 def write_report(run: Path) -> Path:
-    """Write RUN/report.html from what the run directory and its dataset hold, and return its path.
+    """Writes RUN/report.html from the run directory and its dataset, and returns its path.
 
-    What is missing (figures, splats, dataset) is said on the page instead. Raises InputError when the folder has no
+    The page names missing parts (metrics, splats, dataset). Raises InputError when the folder has no
     readable config.json or report.html cannot be written.
     """
     run = Path(run)

@@ -1,4 +1,4 @@
-"""The part of a report that tells where the cameras came from: what `gsopt sfm` found, and what training corrected."""
+"""The report's section about cameras: poses found by `gsopt sfm`, and their refinement by training."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_LINES = 40
 
 
 def cameras_section(dataset: Path, run: Path, messages: list[str]) -> str:
-    """Empty where the poses were given and kept. What cannot be read is left out and said in `messages`."""
+    """HTML, empty when the poses were given and kept; unreadable parts are left out and named in `messages`."""
     lines = [*_sfm_lines(dataset / "sfm.json", messages), *_refinement_lines(run / "poses.json", messages)]
     picture = read_image(dataset / "sfm.png", IMAGE_SIDE, MAX_PIXELS)
     if not lines and picture is None:
@@ -27,7 +27,7 @@ def cameras_section(dataset: Path, run: Path, messages: list[str]) -> str:
 
 
 def _sfm_lines(path: Path, messages: list[str]) -> list[str]:
-    """The report of `gsopt sfm` as it was printed."""
+    """The report that `gsopt sfm` printed."""
     lines = _read(path, messages).get("report")
     return [line.strip() for line in lines[:MAX_LINES] if isinstance(line, str)] if isinstance(lines, list) else []
 
@@ -54,6 +54,6 @@ def _read(path: Path, messages: list[str]) -> dict[str, Any]:
     try:
         document = read_json(path)
     except InputError as error:
-        messages.append(f"Where the cameras came from cannot be shown. {error}")
+        messages.append(f"The origin of the cameras is missing from this report. {error}")
         return {}
     return document if isinstance(document, dict) else {}

@@ -10,13 +10,13 @@ WIDTH, HEIGHT = 360, 210
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 14, 36
 MAX_POINTS = 300
 MIN_LOG_VALUE = 1e-300
-"""Of a logarithmic axis: its ticks must not be 0."""
+"""Least value on a logarithmic axis, so that no tick is 0."""
 
 
 def line_chart(title: str, points: Sequence[tuple[float, float]], *, log: bool = False, unit: str = "") -> str:
     """A figure with axes, the line and its last value. Fewer than two points give a sentence instead.
 
-    `log`: logarithmic vertical axis; points that are not above SMALLEST are left out then.
+    `log`: logarithmic vertical axis; points at or below MIN_LOG_VALUE are left out.
     """
     points = [point for point in points if not log or point[1] > MIN_LOG_VALUE]
     if len(points) < 2:

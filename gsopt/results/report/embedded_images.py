@@ -1,4 +1,4 @@
-"""Pictures that travel inside the page: thumbnails, error maps, an animation, all as data URIs."""
+"""Images embedded in a page as data URIs: thumbnails, error maps, an animation."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from PIL import Image
 from gsopt.data.files import is_regular
 from gsopt.results.video import write_video
 
-QUALITY = 88
+WEBP_QUALITY = 88
 ERROR_FULL_SCALE = 0.25
 """Mean absolute difference of the three channels (of 1) at which the color scale ends; the same for every view."""
-# Dark to bright, so that it reads in grey too: error, red, green, blue.
+# Dark to bright, so that it is readable in gray too: error, red, green, blue.
 ERROR_COLORS = (
     (0.00, 13, 16, 33),
     (0.25, 43, 76, 155),
@@ -27,14 +27,14 @@ ERROR_COLORS = (
 
 
 def shrunk(image: Image.Image, side: int) -> Image.Image:
-    """The image, made to fit into a square of `side` px; never enlarged."""
+    """The image scaled down to fit into a square of `side` px."""
     copy = image.copy()
     copy.thumbnail((side, side), Image.Resampling.LANCZOS)
     return copy
 
 
 def read_image(path: Path, side: int, max_pixels: int) -> Image.Image | None:
-    """A PNG made to fit into a square of `side` px; None for a file that is missing, too large or no picture."""
+    """A PNG scaled down to fit into a square of `side` px; None for a file that is missing, too large or no PNG."""
     if not is_regular(path):
         return None
     try:
@@ -45,14 +45,14 @@ def read_image(path: Path, side: int, max_pixels: int) -> Image.Image | None:
 
 
 def data_uri(image: Image.Image) -> str:
-    """A WebP picture as a data URI."""
+    """The image as the data URI of a WebP."""
     buffer = io.BytesIO()
-    image.save(buffer, format="WEBP", quality=QUALITY, method=4)
+    image.save(buffer, format="WEBP", quality=WEBP_QUALITY, method=4)
     return _uri(buffer.getvalue())
 
 
 def animation_uri(images: Sequence[Image.Image], fps: float) -> str:
-    """An endless animated WebP as a data URI."""
+    """The images as the data URI of an endless animated WebP."""
     buffer = io.BytesIO()
     write_video(buffer, iter(images), ".webp", fps)
     return _uri(buffer.getvalue())

@@ -1,4 +1,4 @@
-"""The part of a report that tells about guidance: what it was asked, how often it acted, and what it changed."""
+"""The report's section about guidance: its prior, the number of guided steps, and renders before and after."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from gsopt.results.report.embedded_images import data_uri, read_image
 
 IMAGE_SIDE = 256
 MAX_ROWS = 8
-"""Rows of pictures that are read of each kind."""
+"""Most rows of images per table."""
 MAX_PIXELS = 2048 * 2048
 BEFORE_AFTER = ("before", "before_uncertainty", "after", "after_uncertainty")
 PROPOSAL = ("render", "proposal", "uncertainty")
 
 Row = tuple[str, list[Image.Image | None]]
-"""A line of text and the pictures above it."""
+"""A line of text and the images above it."""
 
 
 def guidance_section(run: Path, messages: list[str]) -> str:
-    """Empty for a run without guidance. What cannot be read is left out and said in `messages`."""
+    """HTML, empty for a run without guidance; unreadable parts are left out and named in `messages`."""
     folder = run / "guidance"
     if not is_regular(folder / "summary.json"):
         return ""
     try:
         summary = read_json(folder / "summary.json")
     except InputError as error:
-        messages.append(f"What guidance did cannot be shown. {error}")
+        messages.append(f"Guidance is missing from this report. {error}")
         return ""
     views = [_view(folder, view) for view in _numbers(summary.get("views"))]
     steps = [_step(folder, sample) for sample in _objects(summary.get("samples"))]
     return (
         f"<section><h2>Guidance</h2><p>{escape(summary_text(summary))}</p>"
-        + _cards("Least known views before the first guided step and at the end", BEFORE_AFTER, views)
-        + _cards("What the prior was shown, and what it proposed", PROPOSAL, steps)
+        + _cards("Least certain views before the first guided step and after training", BEFORE_AFTER, views)
+        + _cards("Inputs and predictions of the prior", PROPOSAL, steps)
         + "</section>\n"
     )
 
 
 def summary_text(summary: dict[str, Any]) -> str:
-    """How many steps were guided, why others were not, and by what."""
+    """The prior, the number of guided steps, and the reasons for unguided ones."""
     guided, wanted, decided, failed = (_whole(summary.get(key)) for key in ("guided", "wanted", "decided", "failed"))
     guard = summary.get("guard")
     reason = guard.get("reason") if isinstance(guard, dict) else None
@@ -55,12 +55,14 @@ def summary_text(summary: dict[str, Any]) -> str:
     sentences = [
         f"{summary.get('model', 'A diffusion prior')}, policy {summary.get('policy', 'unknown')}, "
         f"lambda {'unknown' if weight is None else weight}" + (f" ({reason})." if reason else "."),
-        f"{guided} of {wanted} steps that the schedule wanted guided were guided.",
+        f"{guided} of {wanted} steps scheduled for guidance were guided.",
     ]
     if decided:
-        sentences.append(f"{decided} were left alone because the input views decide everywhere.")
+        sentences.append(f"{decided} were skipped because the input views determine every pixel.")
     if failed:
-        sentences.append(f"{failed} failed." + (" After that the run went on without." if summary.get("ended") else ""))
+        sentences.append(
+            f"{failed} failed." + (" The run then continued without guidance." if summary.get("ended") else "")
+        )
     return " ".join(sentences)
 
 

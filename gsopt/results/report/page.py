@@ -15,26 +15,32 @@ from gsopt.results.report.read_run import EvaluatedView, Report, number
 
 VIEW_SIDE = 400
 NO_VALUE = "\N{EN DASH}"
-"""Stands where there is no value."""
+"""Replaces a missing value."""
 TURNTABLE_FPS = 12.0
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (Alex)", "lpips_vgg": "LPIPS (VGG)"}
 HINTS = {"psnr": "dB, higher is better", "ssim": "higher is better"}
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
-# Nothing may be loaded from anywhere: pictures are data URIs, styles stand in the page, there are no scripts.
+# The page loads nothing: images are data URIs, styles are inline, and there are no scripts.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
-def page(report: Report) -> str:
-    """The whole document."""
+def html_document(title: str, body: str, extra_style: str = "") -> str:
+    """A self-contained page with the report's style sheet; `body` is finished HTML."""
     style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
-    sections = [header(report), messages(report), views(report), inputs(report), report.cameras, report.guidance]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
-        f'content="light dark"><link rel="icon" href="data:,"><title>{escape(report.name)} · gsopt report</title>'
-        f"<style>\n{style}</style></head>\n<body><main>\n{''.join(sections)}{progress_charts(report)}{settings(report)}</main>\n{footer(report)}</body></html>\n"
+        f'content="light dark"><link rel="icon" href="data:,"><title>{escape(title)}</title>'
+        f"<style>\n{style}{extra_style}</style></head>\n<body>{body}</body></html>\n"
     )
+
+
+def page(report: Report) -> str:
+    """The whole document."""
+    sections = [header(report), messages(report), views(report), inputs(report), report.cameras, report.guidance]
+    sections += [progress_charts(report), settings(report)]
+    return html_document(f"{report.name} · gsopt report", f"<main>\n{''.join(sections)}</main>\n{footer(report)}")
 
 
 def header(report: Report) -> str:
@@ -62,9 +68,9 @@ def _turntable(report: Report) -> str:
 
 def _scope(report: Report) -> str:
     if report.mean and report.held_out:
-        return '<p class="scope">On views the run did not learn from, mean</p>'
+        return '<p class="scope">Means over held-out views</p>'
     if report.mean:
-        return '<p class="scope warn">No view was held out: these are means over <b>training views</b></p>'
+        return '<p class="scope warn">No view was held out. Means over <b>training views</b></p>'
     return '<p class="scope warn">Not evaluated yet: run <code>gsopt eval</code></p>'
 
 
@@ -88,7 +94,7 @@ def _tile(title: str, value: str, hint: str | None) -> str:
 
 
 def messages(report: Report) -> str:
-    """Warnings, each once; the reason why nothing was held out; notes of the evaluation."""
+    """Warnings (each once), the reason when nothing was held out, and notes of the evaluation."""
     notes = report.metrics.get("notes")
     texts = [*report.messages, *(map(str, notes) if isinstance(notes, list) else [])]
     reason = report.metrics.get("reason")
@@ -109,7 +115,7 @@ def views(report: Report) -> str:
     lead = (
         f"Worst: <b>{escape(worst.name)}</b> ({figure('psnr', worst.figures['psnr'])} dB). "
         f"Best: <b>{escape(best.name)}</b> ({figure('psnr', best.figures['psnr'])} dB). "
-        f"{count} shown, by rising PSNR."
+        f"{count} shown, sorted by PSNR."
     )
     cards = f'{error_legend()}<div class="cards">{"".join(map(_card, report.evaluated))}</div>'
     return f"<section><h2>{kind}</h2><p>{lead}</p>{cards}{_table(report)}</section>\n"
@@ -148,7 +154,7 @@ def _table(report: Report) -> str:
 
 
 def inputs(report: Report) -> str:
-    """What the run learned from."""
+    """Input views."""
     if not report.inputs:
         return ""
     left_out = (report.input_count or 0) - len(report.inputs)
@@ -168,7 +174,7 @@ def progress_charts(report: Report) -> str:
         line_chart("PSNR of input views", _series(report, "psnr"), unit=" dB"),
         line_chart("Gaussians", _series(report, "n")),
     )
-    return f'<section><h2>Course of the training</h2><div class="charts">{"".join(charts)}</div></section>\n'
+    return f'<section><h2>Training progress</h2><div class="charts">{"".join(charts)}</div></section>\n'
 
 
 def _series(report: Report, key: str) -> list[tuple[float, float]]:
@@ -177,7 +183,7 @@ def _series(report: Report, key: str) -> list[tuple[float, float]]:
 
 
 def settings(report: Report) -> str:
-    """Every setting; what differs from the default stands out."""
+    """Every setting; those that differ from the default are bold."""
     default = TrainConfig().to_dict()
     rows = "".join(_setting_rows(report.config.to_dict(), default))
     facts = {"first Gaussians": report.recorded.get("gaussians_init"), "symmetry": _symmetry(report)}
@@ -185,13 +191,13 @@ def settings(report: Report) -> str:
         f"<tr><th scope='row'>{name}</th><td>{escape(str(fact))}</td></tr>" for name, fact in facts.items() if fact
     )
     return (
-        "<section><details><summary>Settings</summary><p class='muted'>What differs from the default is bold.</p>"
+        "<section><details><summary>Settings</summary><p class='muted'>Values other than the default are bold.</p>"
         f'<div class="scroll"><table class="settings"><tbody>{extra}{rows}</tbody></table></div></details></section>\n'
     )
 
 
 def _symmetry(report: Report) -> str:
-    """The mirrors that were found, and whether colors were learned from them too."""
+    """The detected mirror planes, and whether mirrored colors were used for training."""
     mirrors = report.recorded.get("symmetry")
     if not isinstance(mirrors, list):
         return ""
@@ -211,7 +217,7 @@ def _setting_rows(values: dict[str, Any], default: dict[str, Any], prefix: str =
 
 
 def footer(report: Report) -> str:
-    """How the figures came about, and the versions."""
+    """Evaluation protocol, versions and seed."""
     protocol = report.metrics.get("protocol")
     text = f"<p>{escape(protocol)}</p>" if isinstance(protocol, str) else ""
     versions = report.recorded.get("versions")

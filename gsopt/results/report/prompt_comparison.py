@@ -1,4 +1,4 @@
-"""One self-contained page that shows sets of prompts side by side: figures, words, pictures."""
+"""One self-contained page that compares sets of prompts: metrics, texts, renders."""
 
 from __future__ import annotations
 
@@ -6,28 +6,26 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib import resources
 
 from PIL import Image
 
 from gsopt._version import __version__
 from gsopt.results.report.embedded_images import data_uri
-from gsopt.results.report.page import POLICY
+from gsopt.results.report.page import NO_VALUE, html_document
 
-NO_VALUE = "\N{EN DASH}"
 MIN_LEAD = 0.05
-"""dB by which a set of prompts has to lead to be called the best."""
+"""Least lead of the best set of prompts, dB."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One set of prompts. Strings are as found: the page escapes them."""
+    """One set of prompts. Strings are unescaped: the page escapes them."""
 
     name: str
     prompts: tuple[tuple[str, str], ...]
     """(source, view, polarity in a few words; text)."""
     psnrs: tuple[float, ...]
-    """Per left-out view, dB."""
+    """PSNR per left-out view, dB."""
     alignment: float | None
     pictures: tuple[Image.Image, ...]
 
@@ -39,18 +37,14 @@ class Column:
 def comparison_page(
     title: str, facts: str, views: Sequence[str], truths: Sequence[Image.Image], columns: Sequence[Column]
 ) -> str:
-    """The whole document. Differences are to the first column."""
-    style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
-        f"<title>{escape(title)} · gsopt prompts</title><style>\n{style}</style></head>\n<body><main>\n"
-        f'<header><p class="eyebrow">gsopt prompts compare</p><h1>{escape(title)}</h1>'
+    """The whole document. Differences refer to the first column."""
+    return html_document(
+        f"{title} · gsopt prompts",
+        f'<main>\n<header><p class="eyebrow">gsopt prompts compare</p><h1>{escape(title)}</h1>'
         f'<p class="muted">{escape(facts)}</p></header>\n'
         f"{_table(views, columns)}{_pictures(views, truths, columns)}{_words(columns)}</main>\n"
-        f"<footer><p>gsopt {escape(__version__)}. Short runs on small images: they rank prompts, they do not measure "
-        "the final quality. Differences of a few tenths of a dB may be chance.</p></footer></body></html>\n"
+        f"<footer><p>gsopt {escape(__version__)}. Short runs on small images rank prompts; they do not measure the "
+        "final quality. Differences of a few tenths of a dB may be chance.</p></footer>",
     )
 
 
@@ -95,4 +89,4 @@ def _words(columns: Sequence[Column]) -> str:
         rows = "".join(f"<tr><th>{escape(what)}</th><td>{escape(text)}</td></tr>" for what, text in column.prompts)
         table = f'<table class="settings"><tbody>{rows}</tbody></table>'
         lists.append(f"<details open><summary>{escape(column.name)}</summary>{table}</details>")
-    return f"<section><h2>Words</h2>{''.join(lists)}</section>\n"
+    return f"<section><h2>Prompts</h2>{''.join(lists)}</section>\n"

@@ -1,4 +1,4 @@
-"""What a report shows, read from a run directory that nobody vouches for."""
+"""Reads the content of a report from a run directory that is not trusted."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 @dataclass(frozen=True)
 class EvaluatedView:
-    """One view that the figures are about."""
+    """One evaluated view."""
 
     name: str
     badge: str
-    """worst, best or nothing."""
+    """`worst`, `best` or empty."""
     figures: dict[str, float | None]
     render: Image.Image
     truth: Image.Image
@@ -55,7 +55,7 @@ class Progress:
 
 @dataclass
 class Report:
-    """Everything on the page. Strings are as found: the page escapes them."""
+    """Content of the page. Strings are unescaped: the page escapes them."""
 
     name: str
     config: TrainConfig
@@ -64,9 +64,9 @@ class Report:
     metrics: dict[str, Any]
     progress: list[Progress]
     messages: list[str]
-    """Warnings and errors of the run, then what the report itself could not do."""
+    """Warnings and errors of the run, then missing parts of the report."""
     held_out: bool = True
-    """Whether `evaluated` and the figures are about views the run did not learn from."""
+    """True when the evaluated views were held out from training."""
     mean: dict[str, float | None] = field(default_factory=dict)
     per_view: list[dict[str, Any]] = field(default_factory=list)
     evaluated: list[EvaluatedView] = field(default_factory=list)
@@ -85,7 +85,7 @@ class Report:
 
 @torch.no_grad()
 def read_run(run: Path, config: TrainConfig) -> Report:
-    """Read and draw what is there. Each part that cannot be had leaves a message instead."""
+    """Reads and renders every part of the report; a missing part leaves a message instead."""
     messages: list[str] = []
     events = _events(run, messages)
     report = Report(
@@ -106,7 +106,7 @@ def read_run(run: Path, config: TrainConfig) -> Report:
         finished = open_run(run)
         _add_renders(report, finished, scene)
     except GsoptError as error:
-        messages.append(f"Some pictures are missing from this report. {error}")
+        messages.append(f"Some images are missing from this report. {error}")
     return report
 
 
@@ -118,7 +118,7 @@ def number(value: object) -> float | None:
 
 
 def progress_of(events: Sequence[dict[str, Any]]) -> list[Progress]:
-    """The course of a run. Where a resumed run went back to a checkpoint, what it took back is left out."""
+    """Progress of a run, without the steps that a resumed run repeated from a checkpoint."""
     progress_charts: list[Progress] = []
     for event in events:
         step = number(event.get("step"))
@@ -132,7 +132,7 @@ def progress_of(events: Sequence[dict[str, Any]]) -> list[Progress]:
 
 
 def representative_rows(psnrs: Sequence[float]) -> list[int]:
-    """Rows to show, from worst to best: the extremes at both ends and an even choice of those between."""
+    """Rows to show, from worst to best: the extremes at both ends and an even selection between them."""
     order = sorted(range(len(psnrs)), key=lambda row: psnrs[row])
     if len(order) <= MAX_EVALUATED_VIEWS:
         return order
@@ -146,7 +146,7 @@ def _events(run: Path, messages: list[str]) -> list[dict[str, Any]]:
     try:
         return read_events(run / "events.jsonl")[0]
     except (GsoptError, OSError) as error:
-        messages.append(f"The course of the run cannot be shown. {error}")
+        messages.append(f"The training progress is missing from this report. {error}")
         return []
 
 
@@ -170,7 +170,7 @@ def _read_object(path: Path, messages: list[str]) -> dict[str, Any]:
 
 
 def _add_figures(report: Report) -> None:
-    """Means and rows of the held-out views; where there are none, of the training views, marked as such."""
+    """Adds means and rows of the held-out views or, without any, of the training views, marked as such."""
     source = report.metrics
     if not isinstance(source.get("mean"), dict) and isinstance(source.get("train"), dict):
         source, report.held_out = source["train"], False

@@ -132,7 +132,7 @@ def test_a_report_without_evaluation_events_dataset_or_splats_says_so(tmp_path: 
     assert "no splat.ply" in Page(write_report(run).read_text(encoding="utf-8")).text
     (tmp_path / "data").rename(tmp_path / "elsewhere")
     text = Page(write_report(run).read_text(encoding="utf-8")).text
-    assert "Some pictures are missing" in text
+    assert "Some images are missing" in text
     assert "Not recorded." in text
     (run / "config.json").unlink()
     with pytest.raises(InputError, match=r"config\.json"):

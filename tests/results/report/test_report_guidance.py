@@ -32,7 +32,7 @@ def write(run: Path, summary: object) -> Path:
     for view in (3, 17):
         for when in ("before", "after"):
             Image.new("RGB", (8, 8), "red").save(folder / f"{when}_{view:02d}.png")
-            Image.new("RGB", (8, 8), "grey").save(folder / f"{when}_{view:02d}_uncertainty.png")
+            Image.new("RGB", (8, 8), "gray").save(folder / f"{when}_{view:02d}_uncertainty.png")
     for kind in ("render", "proposal", "uncertainty"):
         Image.new("RGB", (8, 8), "blue").save(folder / f"step_000012_{kind}.png")
     return run
@@ -43,7 +43,7 @@ def test_it_says_and_shows_what_guidance_did(tmp_path: Path) -> None:
     html = guidance_section(write(tmp_path, SUMMARY), messages)
     assert messages == []
     assert "31 of 40 steps" in html
-    assert "8 were left alone" in html
+    assert "8 were skipped" in html
     assert "+0.31 dB on r_2" in html
     assert "toy &lt;b&gt;prior" in html
     assert "a chair, back view" in html
