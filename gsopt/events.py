@@ -11,7 +11,7 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ LARGEST_LOG = 1 << 28
 LARGEST_METRICS = 64 << 20
 """Bytes of metrics.json that are read."""
 LAST = ("done", "stopped", "error")
+
+Report = Callable[[str], None]
+"""Takes one line of progress, or a warning, for the user."""
 
 
 def write_atomic(path: Path, data: bytes) -> None:

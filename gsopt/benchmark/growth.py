@@ -4,32 +4,33 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from gsopt.benchmark.kernels import Case, Iteration
 from gsopt.benchmark.machine import resident_mb
 from gsopt.benchmark.stopwatch import repeat, spread
+from gsopt.events import Report
 
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)
 SIDES = (64, 128, 256, 512, 1024, 2048)
 FIXED_SIDE, FIXED_COUNT = 800, 100_000
 
 
-def by_count(counts: Sequence[int] = COUNTS, report: Callable[[str], None] = print) -> dict[str, Any]:
+def by_count(counts: Sequence[int] = COUNTS, report: Report = print) -> dict[str, Any]:
     """Iterations at 800 x 800 with more and smaller Gaussians on the same surface."""
     cases = [Case(f"{FIXED_SIDE}x{FIXED_SIDE}/{count}", FIXED_SIDE, FIXED_SIDE, count) for count in counts]
     fixed = f"{FIXED_SIDE}x{FIXED_SIDE} pixels, 1 thread"
     return series("Gaussians", fixed, [(case.count, case) for case in cases], report)
 
 
-def by_pixels(sides: Sequence[int] = SIDES, report: Callable[[str], None] = print) -> dict[str, Any]:
+def by_pixels(sides: Sequence[int] = SIDES, report: Report = print) -> dict[str, Any]:
     """Iterations over the same 100,000 Gaussians at growing resolution."""
     cases = [Case(f"{side}x{side}/{FIXED_COUNT}", side, side, FIXED_COUNT) for side in sides]
     return series("pixels", f"{FIXED_COUNT:,} Gaussians, 1 thread", [(case.width**2, case) for case in cases], report)
 
 
-def series(what: str, fixed: str, cases: Sequence[tuple[int, Case]], report: Callable[[str], None]) -> dict[str, Any]:
+def series(what: str, fixed: str, cases: Sequence[tuple[int, Case]], report: Report) -> dict[str, Any]:
     """One record (`schema.GROWTH`). The exponent is fitted to the upper half, where fixed costs are negligible."""
     measure(cases[0][1])  # the first measurement includes allocations that the process keeps
     points = []

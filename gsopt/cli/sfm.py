@@ -27,7 +27,7 @@ def sfm(
     """
     from gsopt.data.sfm.pipeline import PICTURE, pose_photos
 
-    posed = pose_photos(photos, out or posed_name(photos), config, say=say)
+    posed = pose_photos(photos, out or posed_name(photos), config, report=say)
     for line in posed.diagnosis.lines():
         print(line)
     print(f"{posed.path}: cameras and points in {PICTURE}; train with: gsopt train {posed.path}")

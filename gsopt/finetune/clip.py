@@ -16,8 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt._optional import require
+from gsopt.events import Report
 from gsopt.finetune.captions import common_texts
-from gsopt.finetune.pair_cache import Library, Say
+from gsopt.finetune.pair_cache import Library
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.clip import LONGEST, MEAN, STD
 from gsopt.sds.priors.protocol import Images
@@ -83,7 +84,9 @@ def make_clip(tokenizer: Any, seed: int) -> Any:
     )
 
 
-def train_clip(library: Library, said: Sequence[tuple[str, ...]], steps: int, seed: int, say: Say) -> tuple[Any, Any]:
+def train_clip(
+    library: Library, said: Sequence[tuple[str, ...]], steps: int, seed: int, report: Report
+) -> tuple[Any, Any]:
     """A CLIPModel and its tokenizer, trained to tell the scenes of the library apart; `said` are their texts."""
     tokenizer = make_tokenizer([text for texts in said for text in texts] + list(common_texts()))
     model = make_clip(tokenizer, seed).train()
@@ -106,7 +109,7 @@ def train_clip(library: Library, said: Sequence[tuple[str, ...]], steps: int, se
             model.logit_scale.clamp_(max=float(torch.tensor(SHARPEST).log()))
         mean = float(found.detach()) if step == 0 else mean + 0.02 * (float(found.detach()) - mean)
         if (step + 1) % 100 == 0:
-            say(f"words: step {step + 1}/{steps}  loss {mean:.4f}")
+            report(f"words: step {step + 1}/{steps}  loss {mean:.4f}")
     return model.eval().requires_grad_(False), tokenizer
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gsopt.data.files import is_regular
 from gsopt.errors import InputError
+from gsopt.events import Report
 from gsopt.finetune.reconstruction_pairs import Pairs, make_pairs
 from gsopt.raster.backend import Backend
 
-Say = Callable[[str], None]
 MADE_AS = 2
 """Of what a pair shows; counted up when that changes, so that older files are made again."""
 
@@ -38,7 +38,7 @@ def _made_by(scene: Path, size: int, seed: int) -> str:
 
 
 def collect(
-    scenes: Sequence[Path], fits: int, size: int, seed: int, folder: Path, backend: Backend, say: Say
+    scenes: Sequence[Path], fits: int, size: int, seed: int, folder: Path, backend: Backend, report: Report
 ) -> Library:
     """All pairs of the scenes; what is not in `folder` is made. A scene that cannot be fitted is named and left out."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -52,9 +52,9 @@ def collect(
                 try:
                     make_pairs(scene, size, fit, seed, backend).save(path)
                 except InputError as error:
-                    say(f"{scene.name} is left out: {error}")
+                    report(f"{scene.name} is left out: {error}")
                     break
-                say(f"fitted {scene.name}, {fit + 1} of {fits}")
+                report(f"fitted {scene.name}, {fit + 1} of {fits}")
             parts.append(Pairs.load(path))
             fitted += [scene] if scene not in fitted else []
             owners += [len(fitted) - 1] * len(parts[-1])

@@ -84,7 +84,7 @@ def make_pairs(folder: Path, size: int, fit: int, seed: int, backend: Backend) -
     random = generator(seed, fit, 0, folder.name)
     inputs, others = _dealt(scene, random)
     length = LENGTHS[_below(len(LENGTHS), random)]
-    config = short_config(length, seed + fit)
+    config = reconstruction_config(length, seed + fit)
     scene = with_mirrors(config, replace(scene, train=tuple(inputs)))
     looks = [look(g, scene, [*others, inputs[0]], size, backend) for g in fitted(config, scene, backend)]
     return Pairs.cat(looks)
@@ -114,7 +114,7 @@ def _dealt(scene: Scene, random: torch.Generator) -> tuple[list[View], list[View
     return views[:count], views[count : count + LOOKS]
 
 
-def short_config(length: int, seed: int) -> TrainConfig:
+def reconstruction_config(length: int, seed: int) -> TrainConfig:
     """A run of `length` steps, as a user's but for its size."""
     return TrainConfig(
         iterations=length,

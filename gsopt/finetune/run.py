@@ -16,11 +16,11 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.data.scene import is_posed
 from gsopt.errors import InputError, UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import Report, to_json, write_atomic
 from gsopt.finetune.caption_tokens import Told, tell
 from gsopt.finetune.evaluation import measure, sheet
 from gsopt.finetune.folder import write_folder
-from gsopt.finetune.pair_cache import Library, Say, collect
+from gsopt.finetune.pair_cache import Library, collect
 from gsopt.finetune.text_encoder import find_encoder, said_of_all, words_known
 from gsopt.finetune.trainer import STATE, Training
 from gsopt.finetune.training_config import Course
@@ -79,16 +79,18 @@ def _is(path: Path) -> bool:
     return path.is_dir() and is_posed(path)
 
 
-def start(lessons: Lessons, course: Course, out: Path, base: str | None, threads: int, say: Say) -> dict[str, Any]:
+def start(
+    lessons: Lessons, course: Course, out: Path, base: str | None, threads: int, report: Report
+) -> dict[str, Any]:
     """`finetune` on this machine's compiled backend; `base` as on the command line."""
     if threads:
         torch.set_num_threads(threads)
     folder = None if base is None else EMBEDDED if base == "embedded" else Path(base)
-    return finetune(lessons, course, out, make_backend("auto", threads), folder, say)
+    return finetune(lessons, course, out, make_backend("auto", threads), folder, report)
 
 
 def finetune(
-    lessons: Lessons, course: Course, out: Path, backend: Backend, base: Path | None, say: Say
+    lessons: Lessons, course: Course, out: Path, backend: Backend, base: Path | None, report: Report
 ) -> dict[str, Any]:
     """Train a prior into `out` and return what was measured on the held-out scenes.
 
@@ -96,21 +98,21 @@ def finetune(
     that holds something else.
     """
     _claim(out, lessons, course, base)
-    train, val = (_library(scenes, lessons, out / "pairs", backend, say) for scenes in (lessons.train, lessons.val))
+    train, val = (_library(scenes, lessons, out / "pairs", backend, report) for scenes in (lessons.train, lessons.val))
     assert train is not None
     held = 0 if val is None else len(val.pairs)
-    say(f"{len(train.pairs)} renders of {len(lessons.train)} scenes to learn from, {held} held out")
-    encoder = find_encoder(train, course, out / CLIP, base, say)
+    report(f"{len(train.pairs)} renders of {len(lessons.train)} scenes to learn from, {held} held out")
+    encoder = find_encoder(train, course, out / CLIP, base, report)
     told, told_val = (
         None if encoder is None or part is None else tell(encoder, part, said_of_all(part)) for part in (train, val)
     )
     training = Training(make_unet(course.seed) if base is None else _base(base, told is not None), course, told)
     if (out / STATE).exists():
         training.restore(out / STATE)
-        say(f"continuing at step {training.step}")
+        report(f"continuing at step {training.step}")
     if training.step == course.steps and (out / CARD).exists():
         return dict(read_json(out / CARD).get("measured") or {})
-    training.run(train.pairs, out, _Log(out, training, val, told_val, say))
+    training.run(train.pairs, out, _Log(out, training, val, told_val, report))
     unet = training.averaged()
     measured = {} if val is None else measure(unet, val.pairs, told_val)
     if encoder is not None and val is not None:
@@ -141,10 +143,12 @@ def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> No
     write_atomic(path, to_json(plan))
 
 
-def _library(scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Backend, say: Say) -> Library | None:
+def _library(
+    scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Backend, report: Report
+) -> Library | None:
     if not scenes:
         return None
-    return collect(scenes, lessons.fits, lessons.size, lessons.seed, folder, backend, say)
+    return collect(scenes, lessons.fits, lessons.size, lessons.seed, folder, backend, report)
 
 
 def _base(folder: Path, told: bool) -> Any:
@@ -163,8 +167,8 @@ def _base(folder: Path, told: bool) -> Any:
 class _Log:
     """Hears every step: a line now and then, train.jsonl, and sample sheets of held-out renders."""
 
-    def __init__(self, out: Path, training: Training, val: Library | None, told: Told | None, say: Say) -> None:
-        self._out, self._course, self._training, self._say = out, training.course, training, say
+    def __init__(self, out: Path, training: Training, val: Library | None, told: Told | None, report: Report) -> None:
+        self._out, self._course, self._training, self._report = out, training.course, training, report
         self._val, self._told = val, told
         self._mean: float | None = None
         self._began, self._first = time.monotonic(), training.step
@@ -174,7 +178,7 @@ class _Log:
         if step % 100 == 0 or step == self._course.steps:
             seconds = time.monotonic() - self._began
             left = seconds / max(1, step - self._first) * (self._course.steps - step)
-            self._say(f"step {step}/{self._course.steps}  loss {self._mean:.5f}  ETA {left / 60:.0f} min")
+            self._report(f"step {step}/{self._course.steps}  loss {self._mean:.5f}  ETA {left / 60:.0f} min")
             with (self._out / "train.jsonl").open("a", encoding="utf-8") as log:
                 log.write(json.dumps({"step": step, "loss": self._mean, "seconds": round(seconds, 1)}) + "\n")
         if self._val is not None and step % SHEET_EVERY == 0:

@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 
+from gsopt.events import Report
 from gsopt.finetune.captions import said_of
 from gsopt.finetune.clip import save_clip, train_clip
-from gsopt.finetune.pair_cache import Library, Say
+from gsopt.finetune.pair_cache import Library
 from gsopt.finetune.training_config import Course
 from gsopt.sds.priors.clip import ClipEncoder, load_joint_clip
 from gsopt.sds.priors.view_conditioned import CLIP
@@ -26,7 +27,9 @@ def said_of_all(library: Library) -> list[tuple[str, ...]]:
     return [said_of(scene) for scene in library.scenes]
 
 
-def find_encoder(library: Library, course: Course, folder: Path, base: Path | None, say: Say) -> ClipEncoder | None:
+def find_encoder(
+    library: Library, course: Course, folder: Path, base: Path | None, report: Report
+) -> ClipEncoder | None:
     """The encoder of the words to be taught, kept in `folder`; None where there are none to teach."""
     if not folder.is_dir():
         unfinished = folder.with_name(f"{folder.name}.part")
@@ -35,9 +38,11 @@ def find_encoder(library: Library, course: Course, folder: Path, base: Path | No
         else:
             said = said_of_all(library)
             if course.clip_steps == 0 or len({texts[0] for texts in said if texts}) < FEWEST:
-                say("no words: " + ("--clip-steps is 0" if course.clip_steps == 0 else "the scenes have no captions"))
+                report(
+                    "no words: " + ("--clip-steps is 0" if course.clip_steps == 0 else "the scenes have no captions")
+                )
                 return None
-            model, tokenizer = train_clip(library, said, course.clip_steps, course.seed, say)
+            model, tokenizer = train_clip(library, said, course.clip_steps, course.seed, report)
             save_clip(model, tokenizer, unfinished)
         unfinished.rename(folder)
     clip = load_joint_clip(folder, torch.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from gsopt import check
 from gsopt._optional import require
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError, UsageError
-from gsopt.events import write_atomic
+from gsopt.events import Report, write_atomic
 from gsopt.llm_prompts.deduplicate import without_repetitions
 from gsopt.llm_prompts.expand import Wish, expand, filled_up, own_words
 from gsopt.llm_prompts.schema import LONGEST_NAME, LONGEST_NOTES, MOST_WARNINGS, Made, Prompt, PromptSet
@@ -30,8 +30,6 @@ MOST = 64
 """Prompts that may be asked for."""
 LONGEST_TIMEOUT = 24 * 3600.0
 NOT_SCORED = "the prompts are not scored: the prior has no CLIP that joins words and pictures; give one with --clip"
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,8 @@ class Result:
     talk: Conversation | None = None
 
 
-def make_prompts(job: Job, say: Say) -> Result:
-    """Prompts for the job. `say` hears how it goes.
+def make_prompts(job: Job, report: Report) -> Result:
+    """Prompts for the job. `report` gets the progress.
 
     Raises UsageError and InputError for a job that cannot be done, Refusal where the model cannot be had and no
     fallback to the template is allowed.
@@ -96,7 +94,7 @@ def make_prompts(job: Job, say: Say) -> Result:
     if job.llm == "none":
         result = Result(_set(job, wish, template, (own, *expand(template, wish, counter))), None, counter)
     else:
-        result = _with_model(job, wish, template, counter, views, say)
+        result = _with_model(job, wish, template, counter, views, report)
     made = result.made
     if views and (clip is not None or (folder is not None and (folder / "text_encoder").is_dir())):
         made = scored(made, clip or _encoder(job.prior), views)
@@ -193,7 +191,7 @@ def _views(job: Job) -> tuple[Image.Image, ...]:
 
 
 def _with_model(
-    job: Job, wish: Wish, template: Template, counter: Counter, views: Sequence[Image.Image], say: Say
+    job: Job, wish: Wish, template: Template, counter: Counter, views: Sequence[Image.Image], report: Report
 ) -> Result:
     from gsopt.llm_prompts.client import Refusal, connect
     from gsopt.llm_prompts.expert_images import to_jpegs
@@ -204,9 +202,9 @@ def _with_model(
     try:
         server = connect(job.llm, job.model, job.timeout)
         source = source_of(server.model)
-        say(f"asking {source} at {server.url}, for at most {job.timeout:g} s")
+        report(f"asking {source} at {server.url}, for at most {job.timeout:g} s")
         request = Request(template, wish, job.temperature, job.seed, to_jpegs(views))
-        talk = converse(server, request, counter, say)
+        talk = converse(server, request, counter, report)
     except Refusal as refusal:
         if not job.fallback:
             raise

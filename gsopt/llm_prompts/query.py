@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from gsopt.errors import InputError
+from gsopt.events import Report
 from gsopt.llm_prompts.client import Answer, Refusal, Server, chat
 from gsopt.llm_prompts.expand import Wish, slot_of
 from gsopt.llm_prompts.reply import Read, read_reply, reply_schema
@@ -35,8 +36,6 @@ FRONT_WORDS = {
     "top": "describe what of it is seen from above",
     "negative": "say what a good picture of it must not show",
 }
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class Conversation:
         return sum(r.seconds for r in self.rounds)
 
 
-def converse(server: Server, request: Request, counter: Counter, say: Say) -> Conversation:
+def converse(server: Server, request: Request, counter: Counter, report: Report) -> Conversation:
     """Ask, and ask again for what is missing. Raises Refusal where the server gives no usable HTTP answer at all.
 
     A refusal after the first round keeps what is there.
@@ -110,7 +109,7 @@ def converse(server: Server, request: Request, counter: Counter, say: Say) -> Co
         if answer.finish == "length" and is_thought(answer.text):
             way.room *= MORE_ROOM
         lacking = missing(prompts, wish)
-        say(f"answer {attempt + 1}: {len(prompts)} prompts so far, {sum(lacking.values())} missing")
+        report(f"answer {attempt + 1}: {len(prompts)} prompts so far, {sum(lacking.values())} missing")
         if not lacking:
             break
         messages = [*messages[:2], *repair_messages(answer, replace(read, problems=problems), lacking, wish)]

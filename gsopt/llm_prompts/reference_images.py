@@ -6,7 +6,7 @@ They show what the model takes the words for, not the object: nothing uses them 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -16,7 +16,7 @@ from gsopt import check
 from gsopt._optional import require
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import UsageError
-from gsopt.events import write_atomic
+from gsopt.events import Report, write_atomic
 from gsopt.llm_prompts.schema import MOST_IMAGES, Picture, Prompt
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 MOST_STEPS = 1000
 PAGE = "index.html"
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def cannot_draw(prior: str) -> str | None:
 
 
 def illustrate(
-    prior_name: str, prompts: Sequence[Prompt], drawing: Drawing, folder: Path, say: Say
+    prior_name: str, prompts: Sequence[Prompt], drawing: Drawing, folder: Path, report: Report
 ) -> tuple[tuple[Picture, ...], str | None]:
     """Pictures written to `folder` (none accepted), or the reason why this prior makes none.
 
@@ -77,7 +75,7 @@ def illustrate(
     pipeline = _pipeline(prior)
     for number in range(drawing.count):
         prompt = wanted[number % len(wanted)]
-        say(f"picture {number + 1} of {drawing.count}: {prompt.text}")
+        report(f"picture {number + 1} of {drawing.count}: {prompt.text}")
         image = _draw(pipeline, prior.size, prompt, negative, drawing, number)
         name = _free_name(folder)
         write_atomic(folder / name, _png(image))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 from gsopt.errors import InputError
+from gsopt.events import Report
 from gsopt.llm_prompts.sanitize import printable
 from gsopt.llm_prompts.schema import LONGEST_TEXT, Picture, Prompt, PromptSet, View
 
@@ -17,7 +18,6 @@ HELP = (
 HELP_PICTURE = "  a: accept   Enter or r: reject   q: quit, nothing is changed"
 
 Ask = Callable[[str], str]
-Say = Callable[[str], None]
 
 
 class Abandoned(Exception):
@@ -32,11 +32,11 @@ class Shown:
     accepted: bool | None = None
 
 
-def review(everything: PromptSet, ask: Ask, say: Say) -> PromptSet:
+def review(everything: PromptSet, ask: Ask, report: Report) -> PromptSet:
     """What is left after the review, marked as reviewed. Raises Abandoned when the expert quits or the input ends."""
     try:
-        prompts = _prompts(everything.prompts, ask, say)
-        images = tuple(_picture(picture, ask, say) for picture in everything.images)
+        prompts = _prompts(everything.prompts, ask, report)
+        images = tuple(_picture(picture, ask, report) for picture in everything.images)
     except EOFError as end:
         raise Abandoned from end
     return replace(everything, prompts=prompts, images=images, reviewed=True)
@@ -51,14 +51,14 @@ def line(number: int, count: int, prompt: Prompt) -> str:
     return f"{number:>3}/{count} {sign} {prompt.view:<5} {prompt.source:<8}{weight}{score}  {text}"
 
 
-def _prompts(prompts: tuple[Prompt, ...], ask: Ask, say: Say) -> tuple[Prompt, ...]:
+def _prompts(prompts: tuple[Prompt, ...], ask: Ask, report: Report) -> tuple[Prompt, ...]:
     shown = [Shown(prompt) for prompt in prompts]
-    say(HELP)
+    report(HELP)
     number = 0
     while number < len(shown):
-        say(line(number + 1, len(shown), shown[number].prompt))
+        report(line(number + 1, len(shown), shown[number].prompt))
         if shown[number].prompt.rationale:
-            say(f"        why: {printable(shown[number].prompt.rationale, LONGEST_TEXT)}")
+            report(f"        why: {printable(shown[number].prompt.rationale, LONGEST_TEXT)}")
         answer = ask("? ").strip()
         if answer == "all":
             shown[number:] = [Shown(each.prompt, True) for each in shown[number:]]
@@ -66,12 +66,12 @@ def _prompts(prompts: tuple[Prompt, ...], ask: Ask, say: Say) -> tuple[Prompt, .
         if answer == "b":
             number = max(0, number - 1)
             continue
-        shown[number] = _decided(shown[number], answer, ask, say)
+        shown[number] = _decided(shown[number], answer, ask, report)
         number += shown[number].accepted is not None
     return tuple(each.prompt for each in shown if each.accepted)
 
 
-def _decided(shown: Shown, answer: str, ask: Ask, say: Say) -> Shown:
+def _decided(shown: Shown, answer: str, ask: Ask, report: Report) -> Shown:
     """After one answer; still undecided where it changed something or was not understood."""
     try:
         match answer:
@@ -88,9 +88,9 @@ def _decided(shown: Shown, answer: str, ask: Ask, say: Say) -> Shown:
             case "v":
                 return Shown(replace(shown.prompt, view=_view(ask(f"view ({', '.join(get_args(View))}): "))))
     except InputError as error:
-        say(f"  {error}")
+        report(f"  {error}")
         return replace(shown, accepted=None)
-    say(HELP)
+    report(HELP)
     return replace(shown, accepted=None)
 
 
@@ -114,10 +114,10 @@ def _view(text: str) -> View:
     return Prompt("x", view=text.strip()).view  # type: ignore[arg-type]
 
 
-def _picture(picture: Picture, ask: Ask, say: Say) -> Picture:
+def _picture(picture: Picture, ask: Ask, report: Report) -> Picture:
     while True:
         origin = printable(f"by {picture.source or 'unknown'}, from: {picture.prompt}", LONGEST_TEXT)
-        say(f"    picture {picture.file}, {origin}")
+        report(f"    picture {picture.file}, {origin}")
         answer = ask("accept this picture? ").strip()
         if answer == "q":
             raise Abandoned
@@ -125,4 +125,4 @@ def _picture(picture: Picture, ask: Ask, say: Say) -> Picture:
             return replace(picture, accepted=True)
         if answer in ("", "r", "n", "no"):
             return replace(picture, accepted=False)
-        say(HELP_PICTURE)
+        report(HELP_PICTURE)

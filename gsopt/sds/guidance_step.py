@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from gsopt.config.guidance import GuidanceConfig, settled, sure
 from gsopt.data.scene import Scene, View
 from gsopt.errors import InputError, NumericalError
+from gsopt.events import Report
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.metrics import capped_psnr
@@ -33,8 +33,6 @@ SMALLEST = 0.05
 MAX_PSNR = 60.0
 """dB; from there on images are the same."""
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
-
-Warn = Callable[[str], None]
 
 
 @dataclass
@@ -109,7 +107,7 @@ class Guide:
         iterations: int,
         seed: int,
         background: Float[Tensor, "3"] | None,
-        warn: Warn,
+        warn: Report,
     ) -> None:
         """`weight` is lambda after the guard; `front` the camera whose side is the front; `background` None draws a
         color per step, as the training does."""

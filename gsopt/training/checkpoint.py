@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gsopt.errors import InputError
+from gsopt.events import Report
 
 VERSION = 1
 KEEP = 2
@@ -60,7 +60,7 @@ def saved(folder: Path) -> list[Path]:
     return [path for _, path in sorted(found, reverse=True)]
 
 
-def load_newest(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+def load_newest(folder: Path, warn: Report) -> Checkpoint | None:
     """The newest checkpoint that can be read, None where there is none; every broken one is told to `warn`."""
     for path in saved(folder):
         try:

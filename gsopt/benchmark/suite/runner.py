@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,7 @@ from gsopt.benchmark.machine import machine
 from gsopt.benchmark.suite import result_file, single_run
 from gsopt.benchmark.suite.definition import Case, Suite
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
-
-Report = Callable[[str], None]
+from gsopt.events import Report
 
 
 def work_folder(path: Path) -> Path:

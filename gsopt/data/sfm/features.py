@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -13,8 +13,8 @@ from gsopt.data.sfm.masks import Masked
 from gsopt.data.sfm.photos import Photo
 from gsopt.data.sfm.retrieval import similar_pairs
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.events import Report
 
-Say = Callable[[str], None]
 Pair = tuple[str, str]
 
 ENOUGH_FOR_RADIAL = 20
@@ -114,7 +114,7 @@ def choose_matching(config: SfmConfig, count: int, is_video: bool) -> str:
 
 
 def match(
-    pycolmap: ModuleType, database: Path, names: Sequence[str], matching: str, config: SfmConfig, say: Say
+    pycolmap: ModuleType, database: Path, names: Sequence[str], matching: str, config: SfmConfig, report: Report
 ) -> ViewGraph:
     """Compare the photos that `matching` picks, verify each pair geometrically, and return the graph."""
     pairs = pairs_to_match(pycolmap, database, names, matching, config.seed)
@@ -130,7 +130,7 @@ def match(
         pycolmap.match_image_pairs(
             database, matching_options=options, pairing_options=pairing, verification_options=verification
         )
-        say(f"compared {start + len(part):,} of {len(pairs):,} pairs of photos ({matching})")
+        report(f"compared {start + len(part):,} of {len(pairs):,} pairs of photos ({matching})")
     return read_graph(pycolmap, database)
 
 

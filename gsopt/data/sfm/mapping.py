@@ -14,8 +14,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from gsopt.data.sfm.features import Say, ViewGraph
+from gsopt.data.sfm.features import ViewGraph
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.events import Report
 
 INCREMENTAL_UP_TO = 300
 """Photos up to which `auto` maps incrementally: slower per photo, but it loses fewer."""
@@ -58,7 +59,7 @@ def registered(reconstruction: Any) -> set[str]:
 
 
 def find_poses(
-    pycolmap: ModuleType, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig, say: Say
+    pycolmap: ModuleType, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig, report: Report
 ) -> Mapped | None:
     """The best reconstruction of the mappers that `config.mapper` allows; None when no three photos fit together."""
     best: Mapped | None = None
@@ -66,12 +67,12 @@ def find_poses(
     for mapper in mappers_to_try(config, count):
         models = run_mapper(pycolmap, mapper, database, photos, graph, config)
         if not models:
-            say(f"{mapper} mapping placed no photo")
+            report(f"{mapper} mapping placed no photo")
             continue
         largest = models[0]
         others = [registered(model) - registered(largest) for model in models[1:]]
         mapped = Mapped(largest, mapper, [names for names in others if names])
-        say(f"{mapper} mapping placed {len(mapped.names)} of {count} photos")
+        report(f"{mapper} mapping placed {len(mapped.names)} of {count} photos")
         if best is None or len(mapped.names) > len(best.names):
             best = mapped
         if len(best.names) >= SATISFIED * count:

@@ -25,7 +25,7 @@ from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, features, known_poses, mapping
 from gsopt.data.sfm.diagnosis import Diagnosis
-from gsopt.data.sfm.features import Say, ViewGraph
+from gsopt.data.sfm.features import ViewGraph
 from gsopt.data.sfm.masks import Masked, prepare_masks
 from gsopt.data.sfm.overview_image import draw_scene
 from gsopt.data.sfm.photos import Photo, Refused, find_photos, natural, read_photos
@@ -35,7 +35,7 @@ from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import extract_frames, is_video
 from gsopt.data.sfm.write_scene import write_scene
 from gsopt.errors import InputError, UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import Report, to_json, write_atomic
 
 RECORD, PICTURE = "sfm.json", "sfm.png"
 VERSION = 1
@@ -51,7 +51,7 @@ class Posed:
     """Wall time by stage."""
 
 
-def pose_photos(source: Path, out: Path, config: SfmConfig, say: Say = lambda line: None) -> Posed:
+def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lambda line: None) -> Posed:
     """Find the poses of the photos in `source` (or of the frames of a video) and write the scene folder `out`.
 
     Raises InputError with the whole report when fewer than three photos can be placed, UsageError when `out` exists,
@@ -65,19 +65,19 @@ def pose_photos(source: Path, out: Path, config: SfmConfig, say: Say = lambda li
     pycolmap = require("pycolmap", "sfm", "Finding camera poses")
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # what matters is said by the diagnosis
     with _working_folder(out) as work:
-        run = _Run(pycolmap, source, work, config, say)
-        scene, report = run.posed()
+        run = _Run(pycolmap, source, work, config, report)
+        scene, found = run.posed()
         if out.is_dir():
             out.rmdir()
         os.replace(scene, out)
-    return Posed(out, report, run.seconds)
+    return Posed(out, found, run.seconds)
 
 
 class _Run:
     """One pass through the stages, with their times."""
 
-    def __init__(self, pycolmap: ModuleType, source: Path, work: Path, config: SfmConfig, say: Say) -> None:
-        self.pycolmap, self.source, self.work, self.config, self.say = pycolmap, source, work, config, say
+    def __init__(self, pycolmap: ModuleType, source: Path, work: Path, config: SfmConfig, report: Report) -> None:
+        self.pycolmap, self.source, self.work, self.config, self.report = pycolmap, source, work, config, report
         self.database = work / "database.db"
         self.seconds: dict[str, float] = {}
 
@@ -104,10 +104,10 @@ class _Run:
             paths = find_photos(self.source)
         else:
             chosen = extract_frames(self.source, self.work / "frames", self.config.frames)
-            self.say(f"took {len(chosen.paths)} of {chosen.decoded:,} frames ({chosen.seconds:.1f} s of video)")
+            self.report(f"took {len(chosen.paths)} of {chosen.decoded:,} frames ({chosen.seconds:.1f} s of video)")
             paths = chosen.paths
         photos, refused = read_photos(paths, self.work)
-        self.say(f"read {len(photos)} photos" + (f", refused {len(refused)}" if refused else ""))
+        self.report(f"read {len(photos)} photos" + (f", refused {len(refused)}" if refused else ""))
         return photos, refused
 
     def _prior_frames(self, photos: list[Photo]) -> list[PosedImage] | None:
@@ -132,19 +132,19 @@ class _Run:
         names = [photo.name for photo in photos]
         matching = features.choose_matching(self.config, len(names), is_video(self.source))
         with self._timed("features"):
-            self.say(f"looking for features in {len(names)} photos (masks: {masked.kind})")
+            self.report(f"looking for features in {len(names)} photos (masks: {masked.kind})")
             features.extract(self.pycolmap, self.database, photos, masked, self.config)
             if frames is not None:
                 known_poses.write_cameras(self.pycolmap, self.database, frames)
         with self._timed("matching"):
-            graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.say)
+            graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.report)
         return graph, matching
 
     def _mapped(self, masked: Masked, graph: ViewGraph, frames: list[PosedImage] | None) -> mapping.Mapped | None:
         if len(graph.features) < mapping.SMALLEST_MODEL:
             return None
         if frames is None:
-            return mapping.find_poses(self.pycolmap, self.database, masked.photos, graph, self.config, self.say)
+            return mapping.find_poses(self.pycolmap, self.database, masked.photos, graph, self.config, self.report)
         found = known_poses.triangulate(self.pycolmap, self.database, masked.photos, frames, self.config)
         return mapping.Mapped(found, "poses as given", [])
 

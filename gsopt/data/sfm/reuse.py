@@ -8,12 +8,12 @@ from pathlib import Path
 
 from gsopt.data import files
 from gsopt.data.scene import is_posed
-from gsopt.data.sfm.features import Say
 from gsopt.data.sfm.photos import find_photos
 from gsopt.data.sfm.pipeline import RECORD, fingerprint, pose_photos
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import is_video
 from gsopt.errors import InputError
+from gsopt.events import Report
 
 
 def needs_poses(data: Path) -> bool:
@@ -28,18 +28,18 @@ def needs_poses(data: Path) -> bool:
         return False
 
 
-def posed_scene(data: Path, folder: Path, config: SfmConfig, say: Say) -> Path:
+def posed_scene(data: Path, folder: Path, config: SfmConfig, report: Report) -> Path:
     """FOLDER/<name>-posed with the poses of these photos: an earlier one when the photos are still the same."""
     stem = data.resolve().stem if is_video(data) else data.resolve().name
     names = (f"{stem}-posed" if number == 1 else f"{stem}-posed-{number}" for number in itertools.count(1))
     scene = next(free for free in map(folder.joinpath, names) if not free.exists() or made_from(free, data, config))
     if scene.exists():
-        say(f"poses found earlier: {scene}")
+        report(f"poses found earlier: {scene}")
         return scene
-    say(f"{data} has no poses: looking for them (gsopt sfm)")
-    posed = pose_photos(data, scene, config, say)
+    report(f"{data} has no poses: looking for them (gsopt sfm)")
+    posed = pose_photos(data, scene, config, report)
     for line in posed.diagnosis.lines():
-        say(line)
+        report(line)
     return scene
 
 

@@ -13,10 +13,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from gsopt.errors import InputError, NumericalError, UsageError
-from gsopt.events import write_atomic
+from gsopt.events import Report, write_atomic
 from gsopt.finetune.on_views.images import MOST, Picture, variants
 from gsopt.finetune.on_views.training_config import Preparation
-from gsopt.finetune.pair_cache import Say
 from gsopt.sds.noise import Latents, generator
 from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
@@ -67,7 +66,7 @@ class Lessons:
 
 
 def make_lessons(
-    prior: DiffusersPrior, pictures: Sequence[Picture], how: Preparation, seed: int, folder: Path, say: Say
+    prior: DiffusersPrior, pictures: Sequence[Picture], how: Preparation, seed: int, folder: Path, report: Report
 ) -> Lessons:
     """Lessons of these pictures, kept in `folder`. Raises InputError for a picture that cannot be read."""
     path = folder / LATENTS
@@ -80,31 +79,31 @@ def make_lessons(
         )
     small = sum(picture.side < prior.size for picture in pictures)
     if small:
-        say(
+        report(
             f"{small} of {len(pictures)} images are smaller than {prior.size} px and are enlarged; --size sets the side"
         )
     texts = tuple(dict.fromkeys(["", *(picture.text for picture in pictures)]))
-    tokens = _tokens(prior, texts, say)
+    tokens = _tokens(prior, texts, report)
     said = torch.tensor([texts.index(picture.text) for picture in pictures])
-    lessons = Lessons(_encoded(prior, pictures, how, seed, say), tokens, said)
+    lessons = Lessons(_encoded(prior, pictures, how, seed, report), tokens, said)
     _save(lessons, path)
     return lessons
 
 
-def _tokens(prior: DiffusersPrior, texts: Sequence[str], say: Say) -> Float[Tensor, "m L D"] | None:
+def _tokens(prior: DiffusersPrior, texts: Sequence[str], report: Report) -> Float[Tensor, "m L D"] | None:
     encoder = prior.encoder()
     if encoder is None:
-        say("the model takes no words")
+        report("the model takes no words")
         return None
     for text in texts:
         if encoder.length(text) > encoder.longest:
-            say(f"the prompt {text[:60]!r}... has {encoder.length(text)} tokens; {encoder.longest} of them are read")
+            report(f"the prompt {text[:60]!r}... has {encoder.length(text)} tokens; {encoder.longest} of them are read")
     return encoder.texts(texts)
 
 
 @torch.no_grad()
 def _encoded(
-    prior: DiffusersPrior, pictures: Sequence[Picture], how: Preparation, seed: int, say: Say
+    prior: DiffusersPrior, pictures: Sequence[Picture], how: Preparation, seed: int, report: Report
 ) -> Float[Tensor, "n v C h w"]:
     rows = []
     for row, picture in enumerate(pictures):
@@ -116,7 +115,7 @@ def _encoded(
             )
         rows.append(latents)
         if (row + 1) % TOLD_EVERY == 0 or row + 1 == len(pictures):
-            say(f"encoded {row + 1} of {len(pictures)} images, {len(latents)} variants each")
+            report(f"encoded {row + 1} of {len(pictures)} images, {len(latents)} variants each")
     return torch.stack(rows)
 
 

@@ -17,9 +17,9 @@ from gsopt.data.files import is_regular
 from gsopt.data.images import IMAGE_FORMATS, read_header, read_pixels
 from gsopt.data.scene import View, is_posed, load_scene
 from gsopt.errors import InputError, UsageError
+from gsopt.events import Report
 from gsopt.finetune.captions import said_of
 from gsopt.finetune.on_views.training_config import Preparation
-from gsopt.finetune.pair_cache import Say
 from gsopt.sds.conditioning import NEUTRAL
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.protocol import Images
@@ -62,7 +62,7 @@ class Chosen:
     eval: bool = False
 
 
-def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, say: Say) -> list[Picture]:
+def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, report: Report) -> list[Picture]:
     """Input views of posed scenes, images of folders, and images. InputError where there is none.
 
     `prompt` is said of all; where it is empty, the scene's caption, or what fits any object.
@@ -72,7 +72,7 @@ def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, say: Say) 
     found: list[Picture] = []
     for root in roots:
         if root.is_dir() and is_posed(root):
-            found += _views(root, chosen, prompt, say)
+            found += _views(root, chosen, prompt, report)
         elif (chosen.views, chosen.view_ids, chosen.eval) != (None, None, False):
             raise UsageError(
                 f"`--views`, `--view-ids` and `--eval` choose among the views of a posed scene, which {root} is not. "
@@ -87,10 +87,10 @@ def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, say: Say) 
     return found
 
 
-def _views(root: Path, chosen: Chosen, prompt: str, say: Say) -> list[Picture]:
+def _views(root: Path, chosen: Chosen, prompt: str, report: Report) -> list[Picture]:
     scene = load_scene(DataConfig(str(root), chosen.views, chosen.view_ids, eval=chosen.eval))
     for warning in scene.warnings:
-        say(warning)
+        report(warning)
     text = prompt or next(iter(said_of(root)), NEUTRAL)
 
     def picture(view: View) -> Picture:

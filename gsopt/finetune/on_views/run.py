@@ -14,14 +14,13 @@ import torch
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.errors import InputError, UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import Report, to_json, write_atomic
 from gsopt.finetune.on_views.batches import LATENTS, make_lessons
 from gsopt.finetune.on_views.folder import write_folder
 from gsopt.finetune.on_views.images import Picture
 from gsopt.finetune.on_views.sample_sheet import sheet
 from gsopt.finetune.on_views.trainer import STATE, Training
 from gsopt.finetune.on_views.training_config import Preparation, Study
-from gsopt.finetune.pair_cache import Say
 from gsopt.sds.priors.folder import REMEDIES, DiffusersFolder, find_folder
 from gsopt.sds.priors.stable_diffusion import LARGE, DiffusersPrior, choose_device, has_bfloat16
 from gsopt.sds.priors.view_conditioned import is_view_prior
@@ -35,7 +34,7 @@ TOLD_EVERY = 10
 
 
 def finetune(
-    pictures: Sequence[Picture], study: Study, how: Preparation, out: Path, base: str, say: Say
+    pictures: Sequence[Picture], study: Study, how: Preparation, out: Path, base: str, report: Report
 ) -> dict[str, Any]:
     """Train `base` on the pictures into `out`; the exam's loss before and after.
 
@@ -49,15 +48,15 @@ def finetune(
     claim(out, pictures, study, how, base)
     if (out / CARD).exists():
         return dict(read_json(out / PLAN).get("measured") or {})
-    say(f"{prior.name}: {len(pictures)} images, {how.count} variants each")
-    lessons = make_lessons(prior, pictures, how, study.seed, out, say)
+    report(f"{prior.name}: {len(pictures)} images, {how.count} variants each")
+    lessons = make_lessons(prior, pictures, how, study.seed, out, report)
     training = Training(prior, lessons, study)
     if (out / STATE).exists():
         training.restore(out / STATE)
-        say(f"continuing at step {training.step}")
+        report(f"continuing at step {training.step}")
     if training.before is None:
         training.before = training.exam()
-    log = Log(out, training, say)
+    log = Log(out, training, report)
     if training.step == 0:
         log.show(0)
     training.run(out, log)
@@ -138,8 +137,8 @@ def claim(out: Path, pictures: Sequence[Picture], study: Study, how: Preparation
 class Log:
     """Hears every step: a line now and then, train.jsonl, and sample sheets."""
 
-    def __init__(self, out: Path, training: Training, say: Say) -> None:
-        self._out, self._training, self._say = out, training, say
+    def __init__(self, out: Path, training: Training, report: Report) -> None:
+        self._out, self._training, self._report = out, training, report
         self._mean: float | None = None
         self._began, self._first = time.monotonic(), training.step
 
@@ -149,7 +148,7 @@ class Log:
         if step % TOLD_EVERY == 0 or step == study.steps:
             seconds = time.monotonic() - self._began
             left = seconds / max(1, step - self._first) * (study.steps - step)
-            self._say(f"step {step}/{study.steps}  loss {self._mean:.5f}  ETA {left / 60:.0f} min")
+            self._report(f"step {step}/{study.steps}  loss {self._mean:.5f}  ETA {left / 60:.0f} min")
             with (self._out / "train.jsonl").open("a", encoding="utf-8") as log:
                 log.write(json.dumps({"step": step, "loss": self._mean, "seconds": round(seconds, 1)}) + "\n")
         if study.sheet_every and (step % study.sheet_every == 0 or step == study.steps):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
+from gsopt.events import Report
 from gsopt.llm_prompts.schema import Prompt
 from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
@@ -21,8 +22,6 @@ from gsopt.sds.priors.protocol import Prior
 from gsopt.training.guided.guard import WHITE, HeldOutView, short_config, short_run, spread_views, without
 from gsopt.training.guided.session import EMBEDDED_INPUTS, front_camera, read_references
 from gsopt.training.mirror_images import with_mirrors
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Comparison:
 
 @torch.no_grad()
 def compare_prompts(
-    config: TrainConfig, scene: Scene, backend: Backend, prior: Prior, arms: Sequence[Arm], say: Say
+    config: TrainConfig, scene: Scene, backend: Backend, prior: Prior, arms: Sequence[Arm], report: Report
 ) -> Comparison:
     """Every arm on every left-out view, the same in all else; `config.guidance` says how many and how long.
 
@@ -88,7 +87,7 @@ def compare_prompts(
         for left in lefts:
             known = None if arm.weight == 0 else _conditioning(short, left, prior, arm)
             front = front_camera(config, left.scene)
-            aid = None if known is None else (prior, known, arm.weight, front, say)
+            aid = None if known is None else (prior, known, arm.weight, front, report)
             picture, truth = short_run(short, left, backend, aid)
             drawn.append(picture)
             truths += [truth] if len(truths) < len(lefts) else []
@@ -97,7 +96,7 @@ def compare_prompts(
             float(capped_psnr(picture[None], truth[None])) for picture, truth in zip(drawn, truths, strict=True)
         )
         outcomes.append(Outcome(arm, psnrs, tuple(drawn), sum(scores) / len(scores) if scores else None))
-        say(f"{arm.name}: {outcomes[-1].mean:.2f} dB on {len(lefts)} left-out views")
+        report(f"{arm.name}: {outcomes[-1].mean:.2f} dB on {len(lefts)} left-out views")
     return Comparison(tuple(left.view.name for left in lefts), tuple(truths), tuple(outcomes))
 
 

@@ -25,13 +25,13 @@ from gsopt.config.train import InitConfig, ScheduleConfig, TrainConfig
 from gsopt.data.scene import Scene, View
 from gsopt.data.split import farthest_points
 from gsopt.errors import NumericalError
+from gsopt.events import Report
 from gsopt.geometry.cameras import Cameras
 from gsopt.init import first_gaussians
 from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
 from gsopt.sds import schedule as sds_schedule
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.guidance_step import Warn
 from gsopt.sds.priors.protocol import Prior
 from gsopt.training import schedule
 from gsopt.training.guided.session import RunGuidance, make_guide
@@ -48,7 +48,7 @@ SIDE = 128
 """Longer side of the images of a short run, px, as near as halving comes."""
 GAUSSIANS = 5000
 WHITE = torch.ones(3)
-Aid = tuple[Prior, Conditioning, float, Cameras, Warn]
+Aid = tuple[Prior, Conditioning, float, Cameras, Report]
 """What guides a short run: `make_guide`'s last arguments."""
 
 
@@ -81,7 +81,7 @@ def evaluate_guidance(
     conditioning: Conditioning,
     weight: float,
     front: Cameras,
-    warn: Warn,
+    warn: Report,
 ) -> Verdict:
     """How much of `weight` the run should have, going by input views that were left out."""
     guidance = config.guidance

@@ -14,7 +14,7 @@ from gsopt.config.train import BACKGROUNDS, TrainConfig
 from gsopt.data.files import is_regular
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError, UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.llm_prompts.schema import Prompt, accepted_images, read_prompts, write_prompts
@@ -25,7 +25,7 @@ from gsopt.sds import conditioning as knowledge
 from gsopt.sds import coverage, schedule
 from gsopt.sds.candidate_views import square_views
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.guidance_step import Guide, Warn
+from gsopt.sds.guidance_step import Guide
 from gsopt.sds.priors.protocol import Images, Prior
 
 FOLDER, CONDITIONING = "guidance", "conditioning.safetensors"
@@ -39,7 +39,7 @@ APART = 0.7
 SHOWN_STEPS = 4
 
 
-def make_conditioning(config: TrainConfig, scene: Scene, prior: Prior, folder: Path, warn: Warn) -> Conditioning:
+def make_conditioning(config: TrainConfig, scene: Scene, prior: Prior, folder: Path, warn: Report) -> Conditioning:
     """The run's conditioning, prompts and images encoded, saved for a session that resumes the run."""
     prompts = read_guidance_prompts(config)
     references = read_references(reference_paths(config), prior.size)
@@ -110,7 +110,7 @@ def make_guide(
     conditioning: Conditioning,
     weight: float,
     front: Cameras,
-    warn: Warn,
+    warn: Report,
 ) -> Guide:
     """A guide for this scene."""
     fixed = BACKGROUNDS.get(config.data.background)
