@@ -101,6 +101,7 @@ blender-extension: $(VENV)/.for-test
 lint: $(VENV)/.for-test
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(VENV)/bin/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES))
 	$(PY) -m mypy
 	$(VENV)/bin/lint-imports --no-logo
 

@@ -7,8 +7,8 @@
 namespace gsopt {
 
 struct Camera {
-  // cam_from_world is R (x - pivot) + t. The pivot is a round point near the camera, the origin unless that is far away:
-  // float32 differences keep their digits where float32 coordinates have few.
+  // cam_from_world is R (x - pivot) + t. The pivot is a round point near the camera, the origin unless that is far
+  // away: float32 differences keep their digits where float32 coordinates have few.
   float R[9], t[3], pivot[3];
   float center[3];  // of the camera, from the pivot
   float fx, fy, cx, cy;
@@ -56,18 +56,18 @@ template <class F> struct Splat3D {
 
 // Everything that forward and backward both need.
 template <class F> struct Projected {
-  Vec3<F> offset;         // mean - pivot
-  Vec3<F> t;              // camera space
-  F iz, ux, uy, vx, vy;   // 1/t_z; t_x/t_z, t_y/t_z; the same clamped
-  F qn, qw, qx, qy, qz;   // norm of the quaternion, unit quaternion
+  Vec3<F> offset;        // mean - pivot
+  Vec3<F> t;             // camera space
+  F iz, ux, uy, vx, vy;  // 1/t_z; t_x/t_z, t_y/t_z; the same clamped
+  F qn, qw, qx, qy, qz;  // norm of the quaternion, unit quaternion
   Rotation<F> R;
   Vec3<F> scale;
-  Vec3<F> T0, T1;         // rows of J W
-  Vec3<F> M0, M1;         // rows of J W R S: cov2d = M Mᵀ + eps2d
-  F mx, my, xx, xy, yy;   // mean2d and cov2d
-  F det0, det;            // determinants of M Mᵀ and of cov2d
-  Vec3<F> n;              // M0 x M1
-  F opacity;              // sigmoid, times the antialiasing factor
+  Vec3<F> T0, T1;           // rows of J W
+  Vec3<F> M0, M1;           // rows of J W R S: cov2d = M Mᵀ + eps2d
+  F mx, my, xx, xy, yy;     // mean2d and cov2d
+  F det0, det;              // determinants of M Mᵀ and of cov2d
+  Vec3<F> n;                // M0 x M1
+  F opacity;                // sigmoid, times the antialiasing factor
   F sigmoid, transparency;  // of the logit; 1 - sigmoid without a difference
 };
 
@@ -77,8 +77,10 @@ template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<
   p.offset = g.mean - splat3<F>(cam.pivot);
   p.t = {dot(W0, p.offset) + cam.t[0], dot(W1, p.offset) + cam.t[1], dot(W2, p.offset) + cam.t[2]};
   p.iz = splat<F>(1.f) / p.t.z;
-  p.ux = p.t.x * p.iz, p.uy = p.t.y * p.iz;
-  p.mx = p.ux * cam.fx + cam.cx, p.my = p.uy * cam.fy + cam.cy;
+  p.ux = p.t.x * p.iz;
+  p.uy = p.t.y * p.iz;
+  p.mx = p.ux * cam.fx + cam.cx;
+  p.my = p.uy * cam.fy + cam.cy;
   p.vx = clamp(p.ux, splat<F>(cam.x_min), splat<F>(cam.x_max));
   p.vy = clamp(p.uy, splat<F>(cam.y_min), splat<F>(cam.y_max));
   p.T0 = (W0 - W2 * p.vx) * (p.iz * cam.fx);
@@ -90,21 +92,27 @@ template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<
   const F w = g.qw * ib, x = g.qx * ib, y = g.qy * ib, z = g.qz * ib;
   const F norm = sqrt(w * w + x * x + y * y + z * z), in = splat<F>(1.f) / norm;
   p.qn = norm * big;
-  p.qw = w * in, p.qx = x * in, p.qy = y * in, p.qz = z * in;
+  p.qw = w * in;
+  p.qx = x * in;
+  p.qy = y * in;
+  p.qz = z * in;
   p.R = rotation(p.qw, p.qx, p.qy, p.qz);
   p.scale = {exp(g.log_scale.x), exp(g.log_scale.y), exp(g.log_scale.z)};
 
   p.M0 = {dot(p.T0, p.R.c0) * p.scale.x, dot(p.T0, p.R.c1) * p.scale.y, dot(p.T0, p.R.c2) * p.scale.z};
   p.M1 = {dot(p.T1, p.R.c0) * p.scale.x, dot(p.T1, p.R.c1) * p.scale.y, dot(p.T1, p.R.c2) * p.scale.z};
   const F d0 = dot(p.M0, p.M0), d1 = dot(p.M1, p.M1);
-  p.xx = d0 + cam.eps2d, p.yy = d1 + cam.eps2d, p.xy = dot(p.M0, p.M1);
+  p.xx = d0 + cam.eps2d;
+  p.yy = d1 + cam.eps2d;
+  p.xy = dot(p.M0, p.M1);
   // det(M Mᵀ) = |M0 x M1|²: no difference of large squares, so needles keep their width.
   p.n = cross(p.M0, p.M1);
   p.det0 = dot(p.n, p.n);
   p.det = p.det0 + (d0 + d1) * cam.eps2d + cam.eps2d * cam.eps2d;
 
   const F odds = exp(splat<F>(0.f) - g.logit);
-  p.sigmoid = splat<F>(1.f) / (odds + 1.f), p.transparency = odds * p.sigmoid;
+  p.sigmoid = splat<F>(1.f) / (odds + 1.f);
+  p.transparency = odds * p.sigmoid;
   p.opacity = cam.antialiased ? p.sigmoid * sqrt(p.det0 / p.det) : p.sigmoid;
   return p;
 }
@@ -127,7 +135,8 @@ template <class F> struct SplatGradient {
   F depth;
 };
 
-template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const Whitening<F>& L, const SplatGradient<F>& v) {
+template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const Whitening<F>& L,
+                                                      const SplatGradient<F>& v) {
   // T and M of project(), whitened: dLoss/d(cov2d) is half of Lᵀ [uu uv; uv vv] L, so that L never has to be undone.
   const Vec3<F> T0 = p.T0 * L.A + p.T1 * L.B, T1 = p.T1 * L.C;
   // A M0 + B M1 without its difference: M1·M1 M0 - M0·M1 M1 = M1 x (M0 x M1).
@@ -147,7 +156,7 @@ template <class F> inline Splat3D<F> project_backward(const Camera& cam, const P
   const Vec3<F> P0 = {vM0.x * p.scale.x, vM0.y * p.scale.y, vM0.z * p.scale.z};
   const Vec3<F> P1 = {vM1.x * p.scale.x, vM1.y * p.scale.y, vM1.z * p.scale.z};
   const Vec3<F> r0 = T0 * P0.x + T1 * P1.x, r1 = T0 * P0.y + T1 * P1.y, r2 = T0 * P0.z + T1 * P1.z;
-  // dLoss/dR has columns r0, r1, r2; chain to the unit quaternion, then through the normalisation.
+  // dLoss/dR has columns r0, r1, r2; chain to the unit quaternion, then through the normalization.
   const F w = p.qw, x = p.qx, y = p.qy, z = p.qz;
   const F a12 = r1.z - r2.y, a20 = r2.x - r0.z, a01 = r0.y - r1.x;
   const F s01 = r1.x + r0.y, s02 = r2.x + r0.z, s12 = r2.y + r1.z;
@@ -156,8 +165,10 @@ template <class F> inline Splat3D<F> project_backward(const Camera& cam, const P
   const F gy = (x * s01 + z * s12 + w * a20 - y * (r0.x + r2.z) * 2.f) * 2.f;
   const F gz = (x * s02 + y * s12 + w * a01 - z * (r0.x + r1.y) * 2.f) * 2.f;
   const F radial = w * gw + x * gx + y * gy + z * gz, iq = splat<F>(1.f) / p.qn;
-  out.qw = (gw - w * radial) * iq, out.qx = (gx - x * radial) * iq;
-  out.qy = (gy - y * radial) * iq, out.qz = (gz - z * radial) * iq;
+  out.qw = (gw - w * radial) * iq;
+  out.qx = (gx - x * radial) * iq;
+  out.qy = (gy - y * radial) * iq;
+  out.qz = (gz - z * radial) * iq;
 
   const Vec3<F> wT0 = p.R.c0 * P0.x + p.R.c1 * P0.y + p.R.c2 * P0.z;  // of the whitened T
   const Vec3<F> wT1 = p.R.c0 * P1.x + p.R.c1 * P1.y + p.R.c2 * P1.z;

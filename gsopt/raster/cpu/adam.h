@@ -13,8 +13,10 @@ inline void adam_span(const AdamArguments& a, const AdamParameter& of, int64_t b
   const float d1 = 1.f - a.beta1, d2 = 1.f - a.beta2;
   int64_t i = 0;
   for (; i + kWide <= n; i += kWide) {
-    const wide grad = load_wide(g + i), mean = load_wide(m + i) * a.beta1 + grad * d1, square = load_wide(v + i) * a.beta2 + grad * grad * d2;
-    store_wide(m + i, mean), store_wide(v + i, square);
+    const wide grad = load_wide(g + i), mean = load_wide(m + i) * a.beta1 + grad * d1,
+               square = load_wide(v + i) * a.beta2 + grad * grad * d2;
+    store_wide(m + i, mean);
+    store_wide(v + i, square);
     store_wide(p + i, load_wide(p + i) - mean * of.step_size / (sqrt(square) * of.inv_sqrt_correction2 + a.eps));
   }
   for (; i < n; ++i) {
@@ -24,8 +26,8 @@ inline void adam_span(const AdamArguments& a, const AdamParameter& of, int64_t b
   }
 }
 
-// shN of n <= kWide Gaussians from `first` on, whose gradient no one wrote down. `rows` has room for it and zeros where no band is
-// drawn.
+// shN of n <= kWide Gaussians from `first` on, whose gradient no one wrote down. `rows` has room for it and zeros where
+// no band is drawn.
 inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t first, int n, float* rows) {
   const int bands = (a.sh_degree + 1) * (a.sh_degree + 1) - 1;
   alignas(64) float mean[3][kWide] = {}, Y[15][kWide];
@@ -37,13 +39,16 @@ inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t 
 }
 
 inline void adam_stage(Pool& pool, const AdamArguments& a) {
-  // A multiple of every vector's width: only the last numbers of all are stepped one by one, however many threads there are.
-  const int64_t fair = a.count / (4 * pool.threads()) / 256 * 256, rows = fair < 256 ? 256 : (fair > 16384 ? 16384 : fair);
+  // A multiple of every vector's width: only the last numbers of all are stepped one by one, however many threads there
+  // are.
+  const int64_t fair = a.count / (4 * pool.threads()) / 256 * 256,
+                rows = fair < 256 ? 256 : (fair > 16384 ? 16384 : fair);
   parallel(pool, divide_up(a.count, rows), [&](int chunk, int) {
     const int64_t begin = chunk * rows, end = begin + rows < a.count ? begin + rows : a.count;
     if (a.bands.param) {  // first, while the means are those that were drawn
       alignas(64) float gradient[kWide * kMaxBands * 3 + 1] = {};
-      for (int64_t i = begin; i < end; i += kWide) adam_bands(a, a.bands, i, end - i < kWide ? static_cast<int>(end - i) : kWide, gradient);
+      for (int64_t i = begin; i < end; i += kWide)
+        adam_bands(a, a.bands, i, end - i < kWide ? static_cast<int>(end - i) : kWide, gradient);
     }
     for (const AdamParameter& of : a.others)
       if (of.param) adam_span(a, of, begin * of.stride, (end - begin) * of.stride, of.grad + begin * of.stride);

@@ -26,7 +26,8 @@ inline void sort_stage(Pool& pool, Frame& frame) {
     const uint32_t *key = keys[from]->as<uint32_t>(), *id = ids[from]->as<uint32_t>();
     uint32_t *key_out = keys[1 - from]->as<uint32_t>(), *id_out = ids[1 - from]->as<uint32_t>();
     const auto range = [&](int chunk, int64_t& begin, int64_t& end) {
-      begin = chunk * size, end = begin + size < n ? begin + size : n;
+      begin = chunk * size;
+      end = begin + size < n ? begin + size : n;
     };
     parallel(pool, chunks, [&](int chunk, int) {
       uint32_t* h = histogram + static_cast<int64_t>(chunk) * kRadix;
@@ -40,7 +41,8 @@ inline void sort_stage(Pool& pool, Frame& frame) {
       for (int chunk = 0; chunk < chunks; ++chunk) {
         uint32_t& h = histogram[static_cast<int64_t>(chunk) * kRadix + digit];
         const uint32_t count = h;
-        h = sum, sum += count;
+        h = sum;
+        sum += count;
       }
     }
     parallel(pool, chunks, [&](int chunk, int) {
@@ -49,7 +51,8 @@ inline void sort_stage(Pool& pool, Frame& frame) {
       range(chunk, begin, end);
       for (int64_t i = begin; i < end; ++i) {
         const uint32_t to = h[key[i] >> shift & (kRadix - 1)]++;
-        key_out[to] = key[i], id_out[to] = id[i];
+        key_out[to] = key[i];
+        id_out[to] = id[i];
       }
     });
   }
@@ -72,7 +75,9 @@ inline void count_stage(Pool& pool, Frame& frame, int chunks) {
   parallel(pool, chunks, [&](int chunk, int) {
     uint32_t* mine = counts + static_cast<int64_t>(chunk) * tiles;
     std::memset(mine, 0, sizeof(uint32_t) * tiles);
-    for_each_cover(frame, chunk, chunks, [&](uint32_t id, const Cover& cover) { for_each_tile(frame, cover, id, [&](int tile) { ++mine[tile]; }); });
+    for_each_cover(frame, chunk, chunks, [&](uint32_t id, const Cover& cover) {
+      for_each_tile(frame, cover, id, [&](int tile) { ++mine[tile]; });
+    });
   });
 }
 
@@ -85,7 +90,8 @@ inline void offset_stage(Frame& frame, int chunks) {
     for (int chunk = 0; chunk < chunks; ++chunk) {
       uint32_t& c = counts[static_cast<int64_t>(chunk) * frame.tiles() + tile];
       const uint32_t count = c;
-      c = entry, entry += count;
+      c = entry;
+      entry += count;
     }
   }
   tile_begin[frame.tiles()] = entry;

@@ -1,5 +1,6 @@
-// Stage 3: front-to-back compositing, block by block: what its pixels have become stays in registers while the splats that touch
-// it pass by, a batch at a time: first their alphas, which do not wait for each other, then what they do to the pixels.
+// Stage 3: front-to-back compositing, block by block: what its pixels have become stays in registers while the splats
+// that touch it pass by, a batch at a time: first their alphas, which do not wait for each other, then what they do to
+// the pixels.
 #pragma once
 #include "blocks.h"
 
@@ -14,22 +15,25 @@ struct alignas(64) BlockState {
 };
 
 // The alphas of n splats at the pixels of a block; 0 where they are not drawn.
-inline void alphas_of(const Local& local, const Touched& touched, const uint8_t* list, int n, int block, px alphas[kBatch]) {
+inline void alphas_of(const Local& local, const Touched& touched, const uint8_t* list, int n, int block,
+                      px alphas[kBatch]) {
   const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
   const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
   for (int j = 0; j < n; ++j) {
     const int i = list[j];
     const Local::Row& s = local.row[i];
-    const px u = splat<px>(s.A) * X + (splat<px>(s.B) * Y + splat<px>(touched.u0[i])), v = splat<px>(s.C) * Y + splat<px>(touched.v0[i]);
+    const px u = splat<px>(s.A) * X + (splat<px>(s.B) * Y + splat<px>(touched.u0[i])),
+             v = splat<px>(s.C) * Y + splat<px>(touched.v0[i]);
     const px e = splat<px>(s.log2_opacity) - v * v - u * u;
     alphas[j] = keep(e >= threshold, min(exp2(e), alpha_max));
   }
 }
 
-// Blends the splats of a list into a block, `first` being the number of the chunk's first splat. True when all its pixels
-// have become opaque.
+// Blends the splats of a list into a block, `first` being the number of the chunk's first splat. True when all its
+// pixels have become opaque.
 template <bool Depth, bool Count>
-inline bool blend_block(const Local& local, const Touched& touched, const SplatList& list, int first, int block, bool stop, BlockState& s, Work& work) {
+inline bool blend_block(const Local& local, const Touched& touched, const SplatList& list, int first, int block,
+                        bool stop, BlockState& s, Work& work) {
   const px t_min = splat<px>(kTransmittanceMin);
   // T goes on behind the splat at which a pixel became opaque, so that no splat waits for that; T_end does not.
   px T = load_px(s.T), T_end = T, r = load_px(s.r), g = load_px(s.g), b = load_px(s.b), depth = load_px(s.depth);
@@ -44,22 +48,34 @@ inline bool blend_block(const Local& local, const Touched& touched, const SplatL
       const pxi alive = T > t_min;
       const px alpha = alphas[j], weight = keep(alive, alpha) * T;
       T = T - alpha * T;
-      T_end = select(alive, T, T_end), last = select(alive, splat_pxi(first + i), last);
-      r = r + weight * splat<px>(local.row[i].r), g = g + weight * splat<px>(local.row[i].g), b = b + weight * splat<px>(local.b[i]);
+      T_end = select(alive, T, T_end);
+      last = select(alive, splat_pxi(first + i), last);
+      r = r + weight * splat<px>(local.row[i].r);
+      g = g + weight * splat<px>(local.row[i].g);
+      b = b + weight * splat<px>(local.b[i]);
       if (Depth) depth = depth + weight * splat<px>(local.depth[i]);
-      if (Count) ++work.entries, work.pairs += __builtin_popcount(movemask(weight > splat<px>(0.f)));
+      if (Count) {
+        ++work.entries;
+        work.pairs += __builtin_popcount(movemask(weight > splat<px>(0.f)));
+      }
     }
     T = keep(T > t_min, T);
     opaque = stop && !any(T > t_min);
   }
-  store_px(s.T, T_end), store_px(s.r, r), store_px(s.g, g), store_px(s.b, b), store_px(s.depth, depth), store_pxi(s.last, last);
+  store_px(s.T, T_end);
+  store_px(s.r, r);
+  store_px(s.g, g);
+  store_px(s.b, b);
+  store_px(s.depth, depth);
+  store_pxi(s.last, last);
   return opaque;
 }
 
-// Blends a chunk of n splats, `first` being the number of the first in its tile. Returns the blocks that are not opaque yet;
-// `touched` keeps the blocks that each splat changed.
+// Blends a chunk of n splats, `first` being the number of the first in its tile. Returns the blocks that are not opaque
+// yet; `touched` keeps the blocks that each splat changed.
 template <bool Depth, bool Count>
-inline uint32_t blend_chunk(const Local& local, int n, int first, uint32_t alive, bool stop, Touched& touched, BlockState* states, Work& work) {
+inline uint32_t blend_chunk(const Local& local, int n, int first, uint32_t alive, bool stop, Touched& touched,
+                            BlockState* states, Work& work) {
   SplatList list;
   for (uint32_t rest = alive; rest; rest &= rest - 1) {
     const int block = __builtin_ctz(rest);
@@ -76,13 +92,15 @@ inline void write_block(const Frame& frame, const ForwardOutput& out, int tile, 
   const float* bg = frame.background;
   for_each_row(frame, tile, block, [&](int64_t pixel, int lane, int n) {
     const f4 T = load4(s.T + lane);
-    store_rgb(out.colors + 3 * pixel, {load4(s.r + lane) + T * bg[0], load4(s.g + lane) + T * bg[1], load4(s.b + lane) + T * bg[2]}, n);
+    store_rgb(out.colors + 3 * pixel,
+              {load4(s.r + lane) + T * bg[0], load4(s.g + lane) + T * bg[1], load4(s.b + lane) + T * bg[2]}, n);
     store4_first(out.alphas + pixel, 1.f - T, n);
     if (out.depths) store4_first(out.depths + pixel, load4(s.depth + lane), n);
   });
 }
 
-template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int tile, const ForwardOutput& out, Work& work) {
+template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int tile, const ForwardOutput& out,
+                                                         Work& work) {
   const uint32_t begin = frame.tile_begin.as<uint32_t>()[tile], end = frame.tile_begin.as<uint32_t>()[tile + 1];
   uint32_t* masks = frame.masks.as<uint32_t>();
   const TileGeometry geometry = tile_geometry(frame, tile);
@@ -101,7 +119,8 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
     load_chunk(frame, frame.entries.as<Entry>() + k, n, geometry, local);
     prefetch_records(frame, k + n, k + n + kChunk);
     find_touched(local, n, alive, !frame.skips.tiles, touched);
-    alive = blend_chunk<Depth, Count>(local, n, static_cast<int>(k - begin) + 1, alive, frame.skips.termination, touched, states, work);
+    alive = blend_chunk<Depth, Count>(local, n, static_cast<int>(k - begin) + 1, alive, frame.skips.termination,
+                                      touched, states, work);
     std::memcpy(masks + k, touched.blocks, sizeof(uint32_t) * n);
     k += n;
   }

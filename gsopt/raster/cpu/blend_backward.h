@@ -4,9 +4,10 @@
 // already composited, s = alpha dLoss/dalpha = w (q - A). Behind the last splat A = background·g - dLoss/dalpha_out.
 // T is recovered by dividing by 1 - alpha; it never falls below what the forward pass stopped at.
 //
-// Splat by splat, and for each twice over the blocks that it touches: its alphas, then s and all sums. These stay in registers
-// while the blocks pass by, and a processor that looks some hundred instructions ahead finds several blocks to work on. Each (splat, tile) pair owns one
-// row of sums, so no two threads ever add to the same number and the result does not depend on their order.
+// Splat by splat, and for each twice over the blocks that it touches: its alphas, then s and all sums. These stay in
+// registers while the blocks pass by, and a processor that looks some hundred instructions ahead finds several blocks
+// to work on. Each (splat, tile) pair owns one row of sums, so no two threads ever add to the same number and the
+// result does not depend on their order.
 #pragma once
 #include "tile.h"
 
@@ -27,7 +28,9 @@ inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile,
   for_each_row(frame, tile, block, [&](int64_t pixel, int lane, int n) {
     const Rgb v = load_rgb(in.v_colors + 3 * pixel, n);
     const f4 none = splat<f4>(0.f), v_alpha = in.v_alphas ? load4_first(in.v_alphas + pixel, n) : none;
-    store4(out.r + lane, v.r), store4(out.g + lane, v.g), store4(out.b + lane, v.b);
+    store4(out.r + lane, v.r);
+    store4(out.g + lane, v.g);
+    store4(out.b + lane, v.b);
     store4(out.depth + lane, in.v_depths ? load4_first(in.v_depths + pixel, n) : none);
     store4(out.behind + lane, v.r * bg[0] + v.g * bg[1] + v.b * bg[2] - v_alpha);
   });
@@ -38,8 +41,8 @@ inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile,
 struct Spread {
   px A, B, C, u0, v0, log2_opacity;
   explicit Spread(const Local::Row& r)
-      : A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), u0(splat<px>(-(r.A * r.x + r.B * r.y))), v0(splat<px>(-r.C * r.y)),
-        log2_opacity(splat<px>(r.log2_opacity)) {}
+      : A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), u0(splat<px>(-(r.A * r.x + r.B * r.y))),
+        v0(splat<px>(-r.C * r.y)), log2_opacity(splat<px>(r.log2_opacity)) {}
 };
 struct Exponent {
   px u, v, e;
@@ -47,7 +50,8 @@ struct Exponent {
 inline Exponent exponent(const Spread& s, int block) {
   const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
   Exponent out;
-  out.u = s.A * X + (s.B * Y + s.u0), out.v = s.C * Y + s.v0;
+  out.u = s.A * X + (s.B * Y + s.u0);
+  out.v = s.C * Y + s.v0;
   out.e = s.log2_opacity - out.v * out.v - out.u * out.u;  // v is ready first
   return out;
 }
@@ -62,21 +66,25 @@ inline void alphas_of(const Spread& splat_i, uint32_t mask, Alphas& out) {
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     const Exponent x = exponent(splat_i, __builtin_ctz(rest));
     out.alpha[n] = keep(x.e >= threshold, min(exp2(x.e), alpha_max));
-    out.u[n] = x.u, out.v[n] = x.v;
+    out.u[n] = x.u;
+    out.v[n] = x.v;
   }
 }
 
 // The row of splat `i` of a chunk, entry `index` (one-based) of its tile, over the blocks of `mask`.
 template <bool Depth, bool Abs>
-inline void blend_splat_backward(const Local& local, int i, int index, uint32_t mask, BlockGradient* grads, float* row) {
+inline void blend_splat_backward(const Local& local, int i, int index, uint32_t mask, BlockGradient* grads,
+                                 float* row) {
   const Local::Row& splat_i = local.row[i];
   const px B = splat<px>(splat_i.B), C = splat<px>(splat_i.C);
-  const px r = splat<px>(splat_i.r), g = splat<px>(splat_i.g), b = splat<px>(local.b[i]), depth = splat<px>(local.depth[i]);
+  const px r = splat<px>(splat_i.r), g = splat<px>(splat_i.g), b = splat<px>(local.b[i]),
+           depth = splat<px>(local.depth[i]);
   const px one = splat<px>(1.f), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
   alphas_of(Spread(splat_i), mask, alphas);
-  px wr = zero, wg = zero, wb = zero, wz = zero, s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, abs_x = zero, abs_y = zero;
+  px wr = zero, wg = zero, wb = zero, wz = zero, s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero,
+     abs_x = zero, abs_y = zero;
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     BlockGradient& p = grads[__builtin_ctz(rest)];
@@ -85,13 +93,24 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
     const px gr = load_px(p.r), gg = load_px(p.g), gb = load_px(p.b);
     px q = r * gr + g * gg + b * gb;
     if (Depth) q = q + depth * load_px(p.depth);
-    store_px(p.T, T), store_px(p.behind, behind * past + alpha * q);
-    wr = wr + weight * gr, wg = wg + weight * gg, wb = wb + weight * gb;
+    store_px(p.T, T);
+    store_px(p.behind, behind * past + alpha * q);
+    wr = wr + weight * gr;
+    wg = wg + weight * gg;
+    wb = wb + weight * gb;
     if (Depth) wz = wz + weight * load_px(p.depth);
     const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
     const px u = alphas.u[n], v = alphas.v[n], s_u = s * u, s_v = s * v;
-    s0 = s0 + s, su = su + s_u, sv = sv + s_v, suu = suu + s_u * u, suv = suv + s_u * v, svv = svv + s_v * v;
-    if (Abs) abs_x = abs_x + abs(s_u), abs_y = abs_y + abs(B * s_u + C * s_v);
+    s0 = s0 + s;
+    su = su + s_u;
+    sv = sv + s_v;
+    suu = suu + s_u * u;
+    suv = suv + s_u * v;
+    svv = svv + s_v * v;
+    if (Abs) {
+      abs_x = abs_x + abs(s_u);
+      abs_y = abs_y + abs(B * s_u + C * s_v);
+    }
   }
   const px scale = splat<px>(1.f / kHalfLog2E);
   store_sums(row, {s0, su, sv, suu, suv, svv, wr, wg, wb, wz, abs_x * splat<px>(splat_i.A) * scale, abs_y * scale});

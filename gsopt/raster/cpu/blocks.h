@@ -5,8 +5,8 @@
 namespace gsopt::GSOPT_ISA {
 
 // Per lane the bits of the blocks with a pixel that the ellipse alpha >= 1/255 reaches: bit 4 strip + column. A row of
-// pixels crosses the ellipse from c - h to c + h, c = dx - B/A y and (A h)² = t - (C y)²; a strip is as wide as its rows
-// together. `sqrt_near` is off by 4e-4 at most, so h is taken 4e-4 too large.
+// pixels crosses the ellipse from c - h to c + h, c = dx - B/A y and (A h)² = t - (C y)²; a strip is as wide as its
+// rows together. `sqrt_near` is off by 4e-4 at most, so h is taken 4e-4 too large.
 inline widei block_masks(wide A, wide B, wide C, wide lo, wide dx, wide dy) {
   const wide zero = splat<wide>(0.f), huge = splat<wide>(1e30f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f;
   const wide iA = splat<wide>(1.0004f) / A, slope = B / A;
@@ -15,9 +15,12 @@ inline widei block_masks(wide A, wide B, wide C, wide lo, wide dx, wide dy) {
   for (int strip = 0; strip < kStrips; ++strip) {
     wide left = huge, right = zero - huge;
     for (int row = 0; row < kBlockRows; ++row) {
-      const wide y = splat<wide>(static_cast<float>(kBlockRows * strip + row) - 7.5f) - dy, center = dx - slope * y, v = C * y;
-      const wide half = sqrt_near(t - v * v) * iA;  // NaN, which leaves both bounds alone, where the row misses the ellipse
-      left = min(center - half, left), right = max(center + half, right);
+      const wide y = splat<wide>(static_cast<float>(kBlockRows * strip + row) - 7.5f) - dy, center = dx - slope * y,
+                 v = C * y;
+      const wide half =
+          sqrt_near(t - v * v) * iA;  // NaN, which leaves both bounds alone, where the row misses the ellipse
+      left = min(center - half, left);
+      right = max(center + half, right);
     }
     // Column k holds the centres 4 k - 7.5 ... 4 k - 4.5: those from `first` on and before `behind` are touched.
     const widei behind = to_int(clamp((right + margin) * 0.25f + 2.875f, zero, splat<wide>(4.5f)));
@@ -29,7 +32,7 @@ inline widei block_masks(wide A, wide B, wide C, wide lo, wide dx, wide dy) {
 
 // What the splats of a chunk are in the tile's blocks.
 struct Touched {
-  alignas(64) uint32_t blocks[kChunk];  // bit b: block b
+  alignas(64) uint32_t blocks[kChunk];       // bit b: block b
   alignas(64) float u0[kChunk], v0[kChunk];  // exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
 };
 
@@ -41,7 +44,8 @@ inline void find_touched(const Local& local, int n, uint32_t alive, bool every, 
     wide v[8];
     load_eights([&](int l) { return load8(&local.row[i + l].x); }, v);
     store_widei(blocks + i, every ? splat_widei(-1) : block_masks(v[2], v[3], v[4], v[5], v[0], v[1]));
-    store_wide(touched.u0 + i, zero - (v[2] * v[0] + v[3] * v[1])), store_wide(touched.v0 + i, zero - v[4] * v[1]);
+    store_wide(touched.u0 + i, zero - (v[2] * v[0] + v[3] * v[1]));
+    store_wide(touched.v0 + i, zero - v[4] * v[1]);
   }
   for (int i = 0; i < n; ++i) touched.blocks[i] &= alive;
   for (int i = n; i % kWide; ++i) touched.blocks[i] = 0;

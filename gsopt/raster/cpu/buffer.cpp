@@ -10,7 +10,8 @@ namespace gsopt {
 
 Buffer::~Buffer() { std::free(data_); }
 
-// Large buffers lie on large pages where the system has them: splats are looked up all over, and each page costs a look too.
+// Large buffers lie on large pages where the system has them: splats are looked up all over, and each page costs a look
+// too.
 void Buffer::reserve(size_t bytes) {
   if (bytes <= capacity_) return;
   constexpr size_t kPage = 4096, kLargePage = size_t{1} << 21;

@@ -12,7 +12,8 @@ namespace gsopt::GSOPT_ISA {
 inline double thread_seconds() {
 #if defined(CLOCK_THREAD_CPUTIME_ID)
   timespec t;
-  if (clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t) == 0) return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
+  if (clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t) == 0)
+    return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
 #endif
   return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
@@ -38,7 +39,8 @@ inline Calibration calibrate() {
   // Values the compiler cannot know; both steps stay within [0, 1].
   volatile float half = 0.5f, tenth = 0.1f;
   const px a = splat<px>(half), b = splat<px>(tenth);
-  return {lanes_per_second<10>([a, b](px x) { return x * a + b; }), lanes_per_second<6>([](px x) { return exp2(splat<px>(0.f) - x); })};
+  return {lanes_per_second<10>([a, b](px x) { return x * a + b; }),
+          lanes_per_second<6>([](px x) { return exp2(splat<px>(0.f) - x); })};
 }
 
 }  // namespace gsopt::GSOPT_ISA

@@ -9,17 +9,20 @@ inline f8 joined(f4 a, f4 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 
 #else  // registers of four lanes: of eight a compiler would move one by one
 inline f8 joined(f4 a, f4 b) {
   f8 v;
-  store4(reinterpret_cast<float*>(&v), a), store4(reinterpret_cast<float*>(&v) + 4, b);
+  store4(reinterpret_cast<float*>(&v), a);
+  store4(reinterpret_cast<float*>(&v) + 4, b);
   return v;
 }
 inline f4 four(f8 v, int i) { return load4(reinterpret_cast<const float*>(&v) + 4 * i); }
 #endif
 
-// Of every four lanes of a and b: (a0 b0 a1 b1), (a2 b2 a3 b3), (a0 a1 b0 b1), (a2 a3 b2 b3); of every eight, as fours A B:
-// (A0 B0), (A1 B1).
+// Of every four lanes of a and b: (a0 b0 a1 b1), (a2 b2 a3 b3), (a0 a1 b0 b1), (a2 a3 b2 b3); of every eight, as fours
+// A B: (A0 B0), (A1 B1).
 #if defined(GSOPT_SIXTEEN)
-#define GSOPT_SHUFFLE(name, a0, a1, a2, a3, a4, a5, a6, a7, b0, b1, b2, b3, b4, b5, b6, b7) \
-  inline wide name(wide a, wide b) { return __builtin_shufflevector(a, b, a0, a1, a2, a3, a4, a5, a6, a7, b0, b1, b2, b3, b4, b5, b6, b7); }
+#define GSOPT_SHUFFLE(name, a0, a1, a2, a3, a4, a5, a6, a7, b0, b1, b2, b3, b4, b5, b6, b7)               \
+  inline wide name(wide a, wide b) {                                                                      \
+    return __builtin_shufflevector(a, b, a0, a1, a2, a3, a4, a5, a6, a7, b0, b1, b2, b3, b4, b5, b6, b7); \
+  }
 GSOPT_SHUFFLE(mixed_low, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29)
 GSOPT_SHUFFLE(mixed_high, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31)
 GSOPT_SHUFFLE(twos_low, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
@@ -36,9 +39,10 @@ GSOPT_SHUFFLE(twos_high, 2, 3, 10, 11, 6, 7, 14, 15)
 GSOPT_SHUFFLE(fours_low, 0, 1, 2, 3, 8, 9, 10, 11)
 GSOPT_SHUFFLE(fours_high, 4, 5, 6, 7, 12, 13, 14, 15)
 #else
-#define GSOPT_SHUFFLE(name, a0, a1, a2, a3) \
-  inline wide name(wide a, wide b) { \
-    return joined(__builtin_shufflevector(four(a, 0), four(b, 0), a0, a1, a2, a3), __builtin_shufflevector(four(a, 1), four(b, 1), a0, a1, a2, a3)); \
+#define GSOPT_SHUFFLE(name, a0, a1, a2, a3)                                         \
+  inline wide name(wide a, wide b) {                                                \
+    return joined(__builtin_shufflevector(four(a, 0), four(b, 0), a0, a1, a2, a3),  \
+                  __builtin_shufflevector(four(a, 1), four(b, 1), a0, a1, a2, a3)); \
   }
 GSOPT_SHUFFLE(mixed_low, 0, 4, 1, 5)
 GSOPT_SHUFFLE(mixed_high, 2, 6, 3, 7)
@@ -51,8 +55,12 @@ inline wide fours_high(wide a, wide b) { return joined(four(a, 1), four(b, 1)); 
 
 // In every four lanes, rows become columns.
 inline void transpose_fours(wide v[4]) {
-  const wide a = mixed_low(v[0], v[1]), b = mixed_high(v[0], v[1]), c = mixed_low(v[2], v[3]), d = mixed_high(v[2], v[3]);
-  v[0] = twos_low(a, c), v[1] = twos_high(a, c), v[2] = twos_low(b, d), v[3] = twos_high(b, d);
+  const wide a = mixed_low(v[0], v[1]), b = mixed_high(v[0], v[1]), c = mixed_low(v[2], v[3]),
+             d = mixed_high(v[2], v[3]);
+  v[0] = twos_low(a, c);
+  v[1] = twos_high(a, c);
+  v[2] = twos_low(b, d);
+  v[3] = twos_high(b, d);
 }
 
 // Four floats of each of kWide rows, row(lane), become four columns.
@@ -76,10 +84,12 @@ template <class Row> inline void load_eights(Row&& row, wide v[8]) {
     v[i] = row(i);
 #endif
   }
-  transpose_fours(v), transpose_fours(v + 4);
+  transpose_fours(v);
+  transpose_fours(v + 4);
   for (int i = 0; i < 4; ++i) {
     const wide a = v[i], b = v[i + 4];
-    v[i] = fours_low(a, b), v[i + 4] = fours_high(a, b);
+    v[i] = fours_low(a, b);
+    v[i + 4] = fours_high(a, b);
   }
 }
 

@@ -9,8 +9,8 @@
 
 namespace gsopt {
 
-constexpr int kTile = 16;         // pixels along a tile's side
-constexpr int kChunk = 256;       // splats of a tile that are worked on at once
+constexpr int kTile = 16;    // pixels along a tile's side
+constexpr int kChunk = 256;  // splats of a tile that are worked on at once
 constexpr int kProjectChunk = 1024;
 constexpr int kLargestVector = 16;  // lanes, of any instruction set
 
@@ -68,12 +68,13 @@ struct Parameters {
 };
 
 struct ParameterGradients {
-  float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;  // shN and the last may be null
+  float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d,
+      *means2d_abs;  // shN and the last may be null
 };
 
 // What a frame does not compute because no pixel would change; each can be switched off, to see what it is worth.
 struct Skips {
-  bool tiles = true;        // a splat is listed only in the tiles, and drawn only in the blocks, that its ellipse reaches
+  bool tiles = true;  // a splat is listed only in the tiles, and drawn only in the blocks, that its ellipse reaches
   bool termination = true;  // a block takes no more splats soon after all its pixels are opaque
 };
 
@@ -84,18 +85,18 @@ struct Frame {
   int64_t count = 0, visible = 0, intersections = 0;
   bool depth = false;
   Skips skips;
-  Buffer records;            // Record[count]
-  Buffer covers;             // Cover[count + 1]
-  Buffer keys, order;        // uint32[count]: depth bits, ids, sorted front to back
-  Buffer keys2, order2;      // scratch of the sort
-  Buffer histogram;          // scratch of sort and binning
-  Buffer found;              // Found[chunks]: scratch of projection
-  Buffer tile_begin;         // uint32[tiles + 1]: first entry of a tile
-  Buffer entries;            // Entry[intersections]
-  Buffer masks;              // uint32[intersections]: bit b: the splat reaches block b of the tile, not yet opaque
-  Buffer transmittance;      // float[tiles][blocks][pixels]
-  Buffer last;               // int32[tiles][blocks][pixels]: number in the tile, from 1, of the last splat that counts; 0: none
-  Buffer rows;               // float[intersections][kRow]
+  Buffer records;        // Record[count]
+  Buffer covers;         // Cover[count + 1]
+  Buffer keys, order;    // uint32[count]: depth bits, ids, sorted front to back
+  Buffer keys2, order2;  // scratch of the sort
+  Buffer histogram;      // scratch of sort and binning
+  Buffer found;          // Found[chunks]: scratch of projection
+  Buffer tile_begin;     // uint32[tiles + 1]: first entry of a tile
+  Buffer entries;        // Entry[intersections]
+  Buffer masks;          // uint32[intersections]: bit b: the splat reaches block b of the tile, not yet opaque
+  Buffer transmittance;  // float[tiles][blocks][pixels]
+  Buffer last;  // int32[tiles][blocks][pixels]: number in the tile, from 1, of the last splat that counts; 0: none
+  Buffer rows;  // float[intersections][kRow]
   int tiles() const { return tiles_x * tiles_y; }
 };
 
@@ -136,7 +137,7 @@ struct AdamParameter {
 struct AdamArguments {
   int64_t count;
   float beta1, beta2, eps;
-  AdamParameter bands;      // shN without a gradient, which is found from the rest
+  AdamParameter bands;  // shN without a gradient, which is found from the rest
   AdamParameter others[6];
   const float *means, *v_sh0;
   Camera camera;
@@ -147,12 +148,12 @@ struct AdamArguments {
 struct MatchArguments {
   int64_t padded;
   int taps;
-  const float *offsets;            // [taps, 2], px
-  const float *rays;               // [2, padded]: x and y of (x, y, 1)
-  const float *windows;            // [padded / 8, taps, 2, 8]: a tap's weight, and that times the value less the mean
-  const float *inverse_deviation;  // [padded]
-  const float *planes;             // [3, padded]: inverse depth a x + b y + c
-  const float *corners;            // [height, width, 4]: value at a pixel, right of it, below it, and both
+  const float* offsets;            // [taps, 2], px
+  const float* rays;               // [2, padded]: x and y of (x, y, 1)
+  const float* windows;            // [padded / 8, taps, 2, 8]: a tap's weight, and that times the value less the mean
+  const float* inverse_deviation;  // [padded]
+  const float* planes;             // [3, padded]: inverse depth a x + b y + c
+  const float* corners;            // [height, width, 4]: value at a pixel, right of it, below it, and both
   int width, height;
   float A[9], T[3];      // source pixels, times depth, from the ray and the inverse depth
   float step_x, step_y;  // of a pixel in the ray

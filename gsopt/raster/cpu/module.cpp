@@ -77,8 +77,8 @@ struct Workspace {
   int64_t max_entries = UINT32_MAX;  // (splat, tile) pairs of one frame
   bool count_work = false;
   Skips skips;
-  Work work;                              // summed over frames while count_work is set
-  std::map<std::string, double> seconds;  // wall time per stage since construction
+  Work work;                                  // summed over frames while count_work is set
+  std::map<std::string, double> seconds;      // wall time per stage since construction
   std::map<std::string, double> cpu_seconds;  // the same in CPU time of the whole process
   Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) {}
 };
@@ -105,7 +105,8 @@ Parameters parameters_of(const Model& m, int sh_degree) {
   const size_t n = m.logit_opacities.size();
   const int rest = n ? static_cast<int>(m.shN.size() / (3 * n)) : 0;
   if (rest > kMaxBands) throw std::invalid_argument("shN holds more than the bands of degree 3");
-  if ((sh_degree + 1) * (sh_degree + 1) - 1 > rest && n) throw std::invalid_argument("shN holds fewer bands than sh_degree asks for");
+  if ((sh_degree + 1) * (sh_degree + 1) - 1 > rest && n)
+    throw std::invalid_argument("shN holds fewer bands than sh_degree asks for");
   return {static_cast<int64_t>(n),
           sh_degree,
           rest,
@@ -120,7 +121,8 @@ Parameters parameters_of(const Model& m, int sh_degree) {
 // viewmat [4,4], K [3,3] row-major double: the centre is found in double so that far-away scenes keep their precision.
 Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, int width, int height, double near_plane,
                    double far_plane, double eps2d, bool antialiased) {
-  if (V.size() != 16 || K.size() != 9 || width < 1 || height < 1) throw std::invalid_argument("camera: wrong number of elements");
+  if (V.size() != 16 || K.size() != 9 || width < 1 || height < 1)
+    throw std::invalid_argument("camera: wrong number of elements");
   Camera c;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) c.R[3 * i + j] = static_cast<float>(V[4 * i + j]);
@@ -137,12 +139,22 @@ Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, i
     for (int j = 0; j < 3; ++j) t += V[4 * i + j] * c.pivot[j];
     c.t[i] = static_cast<float>(t);
   }
-  const double fx = K[0], fy = K[4], cx = K[2], cy = K[5], margin_x = kViewMargin * 0.5 * width / fx, margin_y = kViewMargin * 0.5 * height / fy;
-  c.fx = static_cast<float>(fx), c.fy = static_cast<float>(fy), c.cx = static_cast<float>(cx), c.cy = static_cast<float>(cy);
-  c.x_min = static_cast<float>(-(cx / fx + margin_x)), c.x_max = static_cast<float>((width - cx) / fx + margin_x);
-  c.y_min = static_cast<float>(-(cy / fy + margin_y)), c.y_max = static_cast<float>((height - cy) / fy + margin_y);
-  c.near_plane = static_cast<float>(near_plane), c.far_plane = static_cast<float>(far_plane), c.eps2d = static_cast<float>(eps2d);
-  c.width = width, c.height = height, c.antialiased = antialiased;
+  const double fx = K[0], fy = K[4], cx = K[2], cy = K[5], margin_x = kViewMargin * 0.5 * width / fx,
+               margin_y = kViewMargin * 0.5 * height / fy;
+  c.fx = static_cast<float>(fx);
+  c.fy = static_cast<float>(fy);
+  c.cx = static_cast<float>(cx);
+  c.cy = static_cast<float>(cy);
+  c.x_min = static_cast<float>(-(cx / fx + margin_x));
+  c.x_max = static_cast<float>((width - cx) / fx + margin_x);
+  c.y_min = static_cast<float>(-(cy / fy + margin_y));
+  c.y_max = static_cast<float>((height - cy) / fy + margin_y);
+  c.near_plane = static_cast<float>(near_plane);
+  c.far_plane = static_cast<float>(far_plane);
+  c.eps2d = static_cast<float>(eps2d);
+  c.width = width;
+  c.height = height;
+  c.antialiased = antialiased;
   return c;
 }
 
@@ -152,11 +164,13 @@ void reserve_frame(Frame& f, int64_t n) {
   f.covers.reserve(sizeof(Cover) * (n + 1));
   f.found.reserve(sizeof(Found) * (n / kProjectChunk + 1));
   f.tile_begin.reserve(sizeof(uint32_t) * (f.tiles() + 1));
-  for (Buffer* b : {&f.transmittance, &f.last}) b->reserve(sizeof(float) * kTile * kTile * static_cast<size_t>(f.tiles()));
+  for (Buffer* b : {&f.transmittance, &f.last})
+    b->reserve(sizeof(float) * kTile * kTile * static_cast<size_t>(f.tiles()));
 }
 
-void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, const Camera& camera, std::tuple<float, float, float> background,
-             Out colors, Out alphas, std::optional<Out> depths, OutInt radii) {
+void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, const Camera& camera,
+             std::tuple<float, float, float> background, Out colors, Out alphas, std::optional<Out> depths,
+             OutInt radii) {
   std::vector<Work> work(ws.count_work ? ws.pool.threads() : 0);
   const Parameters P = parameters_of(model, sh_degree);
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
@@ -166,17 +180,28 @@ void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, con
                              ws.count_work ? work.data() : nullptr};
   nb::gil_scoped_release release;
   frame.camera = camera;
-  frame.background[0] = std::get<0>(background), frame.background[1] = std::get<1>(background), frame.background[2] = std::get<2>(background);
-  frame.sh_degree = sh_degree, frame.count = P.count, frame.skips = ws.skips;
-  frame.tiles_x = (camera.width + kTile - 1) / kTile, frame.tiles_y = (camera.height + kTile - 1) / kTile;
-  if (frame.tiles_x > 65535 || frame.tiles_y > 65535) throw std::invalid_argument("the image is wider or higher than 1,048,560 pixels");
+  frame.background[0] = std::get<0>(background);
+  frame.background[1] = std::get<1>(background);
+  frame.background[2] = std::get<2>(background);
+  frame.sh_degree = sh_degree;
+  frame.count = P.count;
+  frame.skips = ws.skips;
+  frame.tiles_x = (camera.width + kTile - 1) / kTile;
+  frame.tiles_y = (camera.height + kTile - 1) / kTile;
+  if (frame.tiles_x > 65535 || frame.tiles_y > 65535)
+    throw std::invalid_argument("the image is wider or higher than 1,048,560 pixels");
   reserve_frame(frame, P.count);
   timed(ws, "project", [&] { ws.kernels->project(ws.pool, frame, P, out.radii); });
   bool fits = true;
   timed(ws, "bin", [&] { fits = ws.kernels->bin(ws.pool, frame, ws.max_entries); });
-  if (!fits) throw std::overflow_error("the splats cover " + std::to_string(frame.intersections) + " (splat, tile) pairs, more than " + std::to_string(ws.max_entries));
+  if (!fits)
+    throw std::overflow_error("the splats cover " + std::to_string(frame.intersections) +
+                              " (splat, tile) pairs, more than " + std::to_string(ws.max_entries));
   timed(ws, "blend", [&] { ws.kernels->blend(ws.pool, frame, out); });
-  for (const Work& w : work) ws.work.entries += w.entries, ws.work.pairs += w.pairs;
+  for (const Work& w : work) {
+    ws.work.entries += w.entries;
+    ws.work.pairs += w.pairs;
+  }
 }
 
 struct Gradient {
@@ -186,11 +211,13 @@ struct Gradient {
   std::optional<Out> means2d_abs;
 };
 
-void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std::optional<In> v_alphas, std::optional<In> v_depths, Gradient& g) {
+void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std::optional<In> v_alphas,
+              std::optional<In> v_depths, Gradient& g) {
   const Parameters P = parameters_of(model, frame.sh_degree);
   if (P.count != frame.count) throw std::invalid_argument("backward: not the Gaussians that the frame was drawn from");
   const size_t n = static_cast<size_t>(P.count), pixels = static_cast<size_t>(frame.camera.width) * frame.camera.height;
-  const BackwardInput in = {data_of(v_colors, 3 * pixels, "v_colors"), v_alphas ? data_of(*v_alphas, pixels, "v_alphas") : nullptr,
+  const BackwardInput in = {data_of(v_colors, 3 * pixels, "v_colors"),
+                            v_alphas ? data_of(*v_alphas, pixels, "v_alphas") : nullptr,
                             v_depths ? data_of(*v_depths, pixels, "v_depths") : nullptr};
   const ParameterGradients out = {data_of(g.means, 3 * n, "v_means"),
                                   data_of(g.quats, 4 * n, "v_quats"),
@@ -206,32 +233,56 @@ void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std:
   timed(ws, "project_backward", [&] { ws.kernels->project_backward(ws.pool, frame, P, out); });
 }
 
-std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Out v_rendered, int height, int width, float lambda_dssim) {
+std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Out v_rendered, int height, int width,
+                                       float lambda_dssim) {
   const size_t size = 3 * static_cast<size_t>(height) * width;
-  PhotometricArguments a = {data_of(rendered, size, "rendered"), data_of(target, size, "target"), data_of(v_rendered, size, "v_rendered"),
-                            height, width, lambda_dssim, &ws.scratch, 0, 0};
+  PhotometricArguments a = {data_of(rendered, size, "rendered"),
+                            data_of(target, size, "target"),
+                            data_of(v_rendered, size, "v_rendered"),
+                            height,
+                            width,
+                            lambda_dssim,
+                            &ws.scratch,
+                            0,
+                            0};
   nb::gil_scoped_release release;
   timed(ws, "photometric", [&] { ws.kernels->photometric(ws.pool, a); });
   return {a.l1, a.ssim};
 }
 
 // Rates and numbers of steps, from 1, of the six tensors of a model; 0 steps: that tensor is left alone.
-void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_avg_sq, const std::vector<double>& lr, const std::vector<int64_t>& steps,
-          double beta1, double beta2, double eps, const Camera& camera, int sh_degree) {
+void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_avg_sq, const std::vector<double>& lr,
+          const std::vector<int64_t>& steps, double beta1, double beta2, double eps, const Camera& camera,
+          int sh_degree) {
   if (lr.size() != 6 || steps.size() != 6) throw std::invalid_argument("adam: wrong number of rates or steps");
   const Parameters P = parameters_of(model, sh_degree);
   if (P.count == 0) return;
-  AdamArguments a = {P.count, static_cast<float>(beta1), static_cast<float>(beta2), static_cast<float>(eps), {}, {}, P.means,
-                     data_of(g.sh0, 3 * static_cast<size_t>(P.count), "v_sh0"), camera, sh_degree};
-  const std::array<Out*, 6> gradients = {&g.means, &g.quats, &g.log_scales, &g.logit_opacities, &g.sh0, g.shN ? &*g.shN : nullptr};
+  AdamArguments a = {P.count,
+                     static_cast<float>(beta1),
+                     static_cast<float>(beta2),
+                     static_cast<float>(eps),
+                     {},
+                     {},
+                     P.means,
+                     data_of(g.sh0, 3 * static_cast<size_t>(P.count), "v_sh0"),
+                     camera,
+                     sh_degree};
+  const std::array<Out*, 6> gradients = {&g.means,           &g.quats, &g.log_scales,
+                                         &g.logit_opacities, &g.sh0,   g.shN ? &*g.shN : nullptr};
   for (int k = 0; k < 6; ++k) {
     Out &param = *model.all()[k], &m = *exp_avg.all()[k], &v = *exp_avg_sq.all()[k];
     const size_t size = param.size();
     if (steps[k] == 0 || size == 0) continue;
-    const double c1 = 1.0 - std::pow(beta1, static_cast<double>(steps[k])), c2 = 1.0 - std::pow(beta2, static_cast<double>(steps[k]));
+    const double c1 = 1.0 - std::pow(beta1, static_cast<double>(steps[k])),
+                 c2 = 1.0 - std::pow(beta2, static_cast<double>(steps[k]));
     AdamParameter& out = gradients[k] ? a.others[k] : a.bands;
-    out = {param.data(), data_of(m, size, "exp_avg"), data_of(v, size, "exp_avg_sq"), gradients[k] ? data_of(*gradients[k], size, "grad") : nullptr,
-           static_cast<int64_t>(size) / P.count, static_cast<float>(lr[k] / c1), static_cast<float>(1.0 / std::sqrt(c2))};
+    out = {param.data(),
+           data_of(m, size, "exp_avg"),
+           data_of(v, size, "exp_avg_sq"),
+           gradients[k] ? data_of(*gradients[k], size, "grad") : nullptr,
+           static_cast<int64_t>(size) / P.count,
+           static_cast<float>(lr[k] / c1),
+           static_cast<float>(1.0 / std::sqrt(c2))};
   }
   nb::gil_scoped_release release;
   timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
@@ -244,14 +295,30 @@ struct Windows {
 };
 
 // A: 9 and T: 3 floats; costs and each third of `planes` have one element per ray.
-void match(Workspace& ws, const Windows& w, In corners, int height, int width, const std::vector<float>& A, const std::vector<float>& T, In planes, Out costs) {
+void match(Workspace& ws, const Windows& w, In corners, int height, int width, const std::vector<float>& A,
+           const std::vector<float>& T, In planes, Out costs) {
   const size_t padded = costs.size(), taps = w.offsets.size() / 2;
-  if (A.size() != 9 || T.size() != 3 || padded % 8 || width < 2 || height < 2) throw std::invalid_argument("match: wrong number of elements");
-  MatchArguments a = {static_cast<int64_t>(padded), static_cast<int>(taps), w.offsets.data(), data_of(w.rays, 2 * padded, "rays"),
-                      data_of(w.windows, 2 * taps * padded, "windows"), data_of(w.inverse_deviation, padded, "inverse_deviation"),
-                      data_of(planes, 3 * padded, "planes"), data_of(corners, 4 * static_cast<size_t>(height) * width, "corners"),
-                      width, height, {}, {}, w.step_x, w.step_y, w.least_variance, w.unseen, costs.data()};
-  std::copy(A.begin(), A.end(), a.A), std::copy(T.begin(), T.end(), a.T);
+  if (A.size() != 9 || T.size() != 3 || padded % 8 || width < 2 || height < 2)
+    throw std::invalid_argument("match: wrong number of elements");
+  MatchArguments a = {static_cast<int64_t>(padded),
+                      static_cast<int>(taps),
+                      w.offsets.data(),
+                      data_of(w.rays, 2 * padded, "rays"),
+                      data_of(w.windows, 2 * taps * padded, "windows"),
+                      data_of(w.inverse_deviation, padded, "inverse_deviation"),
+                      data_of(planes, 3 * padded, "planes"),
+                      data_of(corners, 4 * static_cast<size_t>(height) * width, "corners"),
+                      width,
+                      height,
+                      {},
+                      {},
+                      w.step_x,
+                      w.step_y,
+                      w.least_variance,
+                      w.unseen,
+                      costs.data()};
+  std::copy(A.begin(), A.end(), a.A);
+  std::copy(T.begin(), T.end(), a.T);
   nb::gil_scoped_release release;
   timed(ws, "match", [&] { ws.kernels->match(ws.pool, a); });
 }
@@ -270,11 +337,19 @@ NB_MODULE(_cpu, m) {
       .def_prop_ro("isa", [](const Workspace& w) { return std::string(w.kernels->name); })
       .def_ro("seconds", &Workspace::seconds)
       .def_ro("cpu_seconds", &Workspace::cpu_seconds)
-      .def("calibrate", [](const Workspace& w) { const Calibration c = w.kernels->calibrate(); return std::tuple(c.fma, c.exp); })
+      .def("calibrate",
+           [](const Workspace& w) {
+             const Calibration c = w.kernels->calibrate();
+             return std::tuple(c.fma, c.exp);
+           })
       .def_rw("count_work", &Workspace::count_work)
       .def_rw("max_entries", &Workspace::max_entries)
-      .def_prop_rw("skip_tiles", [](const Workspace& w) { return w.skips.tiles; }, [](Workspace& w, bool on) { w.skips.tiles = on; })
-      .def_prop_rw("skip_terminated", [](const Workspace& w) { return w.skips.termination; }, [](Workspace& w, bool on) { w.skips.termination = on; })
+      .def_prop_rw(
+          "skip_tiles", [](const Workspace& w) { return w.skips.tiles; },
+          [](Workspace& w, bool on) { w.skips.tiles = on; })
+      .def_prop_rw(
+          "skip_terminated", [](const Workspace& w) { return w.skips.termination; },
+          [](Workspace& w, bool on) { w.skips.termination = on; })
       .def_prop_ro("work", [](const Workspace& w) { return std::tuple(w.work.entries, w.work.pairs); })
       .def_prop_ro("threads", [](const Workspace& w) { return w.pool.threads(); });
   nb::class_<Frame>(m, "Frame")
@@ -282,26 +357,32 @@ NB_MODULE(_cpu, m) {
       .def_ro("visible", &Frame::visible)
       .def_ro("intersections", &Frame::intersections);
   nb::class_<Camera>(m, "Camera")
-      .def("__init__", [](Camera* self, const std::vector<double>& V, const std::vector<double>& K, int width, int height, double near_plane,
-                          double far_plane, double eps2d, bool antialiased) {
+      .def("__init__", [](Camera* self, const std::vector<double>& V, const std::vector<double>& K, int width,
+                          int height, double near_plane, double far_plane, double eps2d, bool antialiased) {
         new (self) Camera(make_camera(V, K, width, height, near_plane, far_plane, eps2d, antialiased));
       });
   // noconvert: what is to be written must not be a copy.
   nb::class_<Model>(m, "Model")
-      .def(nb::init<Out, Out, Out, Out, Out, Out>(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
-           nb::arg().noconvert(), nb::arg().noconvert());
+      .def(nb::init<Out, Out, Out, Out, Out, Out>(), nb::arg().noconvert(), nb::arg().noconvert(),
+           nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert());
   nb::class_<Gradient>(m, "Gradient")
-      .def("__init__", [](Gradient* self, Out means, Out quats, Out log_scales, Out logit_opacities, Out sh0, std::optional<Out> shN, Out means2d,
-                          std::optional<Out> means2d_abs) {
-        new (self) Gradient{means, quats, log_scales, logit_opacities, sh0, shN, means2d, means2d_abs};
-      }, nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
-         nb::arg().noconvert().none(), nb::arg().noconvert(), nb::arg().noconvert().none());
-  m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg());
-  m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg());
+      .def(
+          "__init__",
+          [](Gradient* self, Out means, Out quats, Out log_scales, Out logit_opacities, Out sh0, std::optional<Out> shN,
+             Out means2d, std::optional<Out> means2d_abs) {
+            new (self) Gradient{means, quats, log_scales, logit_opacities, sh0, shN, means2d, means2d_abs};
+          },
+          nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
+          nb::arg().noconvert(), nb::arg().noconvert().none(), nb::arg().noconvert(), nb::arg().noconvert().none());
+  m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+        nb::arg().none(), nb::arg());
+  m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(),
+        nb::arg());
   m.def("photometric", &photometric);
   m.def("adam", &adam);
   nb::class_<Windows>(m, "Windows")
-      .def("__init__", [](Windows* self, In offsets, In rays, In windows, In inverse_deviation, float step_x, float step_y, float least_variance, float unseen) {
+      .def("__init__", [](Windows* self, In offsets, In rays, In windows, In inverse_deviation, float step_x,
+                          float step_y, float least_variance, float unseen) {
         new (self) Windows{offsets, rays, windows, inverse_deviation, step_x, step_y, least_variance, unseen};
       });
   m.def("match", &match);

@@ -3,9 +3,9 @@
 // SSIM needs five filtered images; only the sum of the two variances enters, so four do: x, y, x² + y², x y. The
 // 11-tap window is separable: first down the columns, two rows of output at a time, so that each input is loaded once
 // for both and the squares and products need no image of their own; then along the rows of interleaved RGB, where
-// neighbors are three floats apart. The gradient of SSIM is again a filtered image, five rows later: what it is made of waits
-// for it in a ring of rows that stays in the cache. Each row of a strip has its own sum, and these are added in double in
-// one order: the same bits for any number of threads.
+// neighbors are three floats apart. The gradient of SSIM is again a filtered image, five rows later: what it is made of
+// waits for it in a ring of rows that stays in the cache. Each row of a strip has its own sum, and these are added in
+// double in one order: the same bits for any number of threads.
 #pragma once
 #include "frame.h"
 #include "parallel.h"
@@ -36,7 +36,12 @@ struct Band {
   // With what its filtered rows need around it; it begins at an even row, as every pair of rows does.
   Band grown() const {
     const int left = x0 < kHalo ? 0 : x0 - kHalo, right = x0 + n + kHalo > width ? width : x0 + n + kHalo;
-    return {y0 < kRadius + 1 ? 0 : y0 - kRadius - 1, y1 + kRadius > height ? height : y1 + kRadius, left, right - left, width, height};
+    return {y0 < kRadius + 1 ? 0 : y0 - kRadius - 1,
+            y1 + kRadius > height ? height : y1 + kRadius,
+            left,
+            right - left,
+            width,
+            height};
   }
 };
 
@@ -53,7 +58,8 @@ struct Image {
 template <int Shift> inline wide both_sides(const float* center) {
 #if defined(__AVX512F__)
   // Out of whole lines of the cache: loads that lie in two cost twice.
-  const auto before = (__m512i)load_wide(center - kWide), here = (__m512i)load_wide(center), behind = (__m512i)load_wide(center + kWide);
+  const auto before = (__m512i)load_wide(center - kWide), here = (__m512i)load_wide(center),
+             behind = (__m512i)load_wide(center + kWide);
   return (wide)_mm512_alignr_epi32(here, before, kWide - Shift) + (wide)_mm512_alignr_epi32(behind, here, Shift);
 #else
   return load_wide(center - Shift) + load_wide(center + Shift);
@@ -79,7 +85,10 @@ template <int Maps> class Columns {
         wide input[Images], value[Maps];
         for (int m = 0; m < Images; ++m) input[m] = load_wide(rows[m][k] + at);
         combine(input, value);
-        for (int m = 0; m < Maps; ++m) sum[0][m] += value[m] * kPairWindow.at[k][0], sum[1][m] += value[m] * kPairWindow.at[k][1];
+        for (int m = 0; m < Maps; ++m) {
+          sum[0][m] += value[m] * kPairWindow.at[k][0];
+          sum[1][m] += value[m] * kPairWindow.at[k][1];
+        }
       }
       for (int r = 0; r < 2; ++r)
         for (int m = 0; m < Maps; ++m) store_wide(&data[r][m][first + at - b.x0 + kPad], sum[r][m]);
@@ -89,15 +98,18 @@ template <int Maps> class Columns {
   // Along one of the two rows, at float i of the strip.
   wide filter(int row, int map, int i) const {
     const float* center = &data[row][map][kPad + i];
-    const wide sum = load_wide(center) * kWindow[0] + both_sides<3>(center) * kWindow[1] + both_sides<6>(center) * kWindow[2];
-    return sum + both_sides<9>(center) * kWindow[3] + both_sides<12>(center) * kWindow[4] + both_sides<15>(center) * kWindow[5];
+    const wide sum =
+        load_wide(center) * kWindow[0] + both_sides<3>(center) * kWindow[1] + both_sides<6>(center) * kWindow[2];
+    return sum + both_sides<9>(center) * kWindow[3] + both_sides<12>(center) * kWindow[4] +
+           both_sides<15>(center) * kWindow[5];
   }
 
  private:
   static constexpr int kPad = kHalo + 1, kStride = divide_up(kStrip + 2 * kHalo + 2 * kPad + kWide, 16) * 16;
   static constexpr float kNothing[kStride] = {};
 
-  // A row of an image from `first` on: zeros above and below it, a copy that fills a vector where it is too narrow for one.
+  // A row of an image from `first` on: zeros above and below it, a copy that fills a vector where it is too narrow for
+  // one.
   const float* row_of(const Image& image, int y, float copy[kWide]) const {
     if (y < 0 || y >= b.height) return kNothing;
     const float* row = image.at(y, first);
@@ -147,18 +159,25 @@ inline double total(wide v) {
 }
 
 // Two rows of SSIM's partials from y on, into three maps; SSIM itself is summed over rows and floats of `inner`.
-inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&images)[2], const Image (&maps)[3], const Band& inner, double* row_ssim) {
+inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&images)[2], const Image (&maps)[3],
+                      const Band& inner, double* row_ssim) {
   columns.fill(y, images, [](const wide* in, wide* value) {
     const wide x = in[0], target = in[1];
-    value[0] = x, value[1] = target, value[2] = x * x + target * target, value[3] = x * target;
+    value[0] = x;
+    value[1] = target;
+    value[2] = x * x + target * target;
+    value[3] = x * target;
   });
   for (int r = 0; r < 2 && y + r < b.y1; ++r) {
     float *mean = maps[0].at(y + r, b.x0), *square = maps[1].at(y + r, b.x0), *product = maps[2].at(y + r, b.x0);
     alignas(64) float ssim[kStrip + 2 * kHalo + kWide];
     for (int i = 0; i < b.n; i += kWide) {
       wide d[3];
-      store_wide(ssim + i, ssim_partials(columns.filter(r, 0, i), columns.filter(r, 1, i), columns.filter(r, 2, i), columns.filter(r, 3, i), d[0], d[1], d[2]));
-      store_first(mean + i, d[0], b.n - i), store_first(square + i, d[1], b.n - i), store_first(product + i, d[2], b.n - i);
+      store_wide(ssim + i, ssim_partials(columns.filter(r, 0, i), columns.filter(r, 1, i), columns.filter(r, 2, i),
+                                         columns.filter(r, 3, i), d[0], d[1], d[2]));
+      store_first(mean + i, d[0], b.n - i);
+      store_first(square + i, d[1], b.n - i);
+      store_first(product + i, d[2], b.n - i);
     }
     if (y + r < inner.y0 || y + r >= inner.y1) continue;
     wide sum = splat<wide>(0.f);
@@ -170,16 +189,21 @@ inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&i
 
 // Two rows of the gradient from y on. The window is symmetric, so its transpose is itself:
 // v = F(d_mean) + 2 x F(d_square) + y F(d_product).
-inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y, const Image (&maps)[3], double* row_l1) {
+inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y,
+                          const Image (&maps)[3], double* row_l1) {
   const double count = static_cast<double>(b.width) * b.height;
-  const wide w_l1 = splat<wide>(static_cast<float>((1.0 - a.lambda_dssim) / count)), w_ssim = splat<wide>(static_cast<float>(-a.lambda_dssim / count));
+  const wide w_l1 = splat<wide>(static_cast<float>((1.0 - a.lambda_dssim) / count)),
+             w_ssim = splat<wide>(static_cast<float>(-a.lambda_dssim / count));
   const wide zero = splat<wide>(0.f);
-  columns.fill(y, maps, [](const wide* in, wide* value) { for (int m = 0; m < 3; ++m) value[m] = in[m]; });
+  columns.fill(y, maps, [](const wide* in, wide* value) {
+    for (int m = 0; m < 3; ++m) value[m] = in[m];
+  });
   for (int r = 0; r < 2 && y + r < b.y1; ++r) {
     const int64_t at = static_cast<int64_t>(y + r) * b.width + b.x0;
     wide sum = zero;
     for (int i = 0; i < b.n; i += kWide) {
-      const wide x = load_first(a.rendered + at + i, b.n - i), target = load_first(a.target + at + i, b.n - i), difference = x - target;
+      const wide x = load_first(a.rendered + at + i, b.n - i), target = load_first(a.target + at + i, b.n - i),
+                 difference = x - target;
       sum += first_of(abs(difference), b.n - i);
       const wide sign = select(difference > 0.f, w_l1, select(difference < 0.f, zero - w_l1, zero));
       const wide g = columns.filter(r, 0, i) + x * 2.f * columns.filter(r, 1, i) + target * columns.filter(r, 2, i);
@@ -190,37 +214,49 @@ inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, co
 }
 
 // The partials run ahead of the gradient by the rows that its window reaches.
-inline void photometric_band(const PhotometricArguments& a, const Band& b, float* ring, double* row_ssim, double* row_l1) {
+inline void photometric_band(const PhotometricArguments& a, const Band& b, float* ring, double* row_ssim,
+                             double* row_l1) {
   const Band around = b.grown();
   const int64_t stride = kRingStride;
-  const Image images[2] = {{const_cast<float*>(a.rendered), b.width, 1 << 30, 0}, {const_cast<float*>(a.target), b.width, 1 << 30, 0}};
-  const Image maps[3] = {{ring, stride, kRing, around.x0}, {ring + kRing * stride, stride, kRing, around.x0}, {ring + 2 * kRing * stride, stride, kRing, around.x0}};
+  const Image images[2] = {{const_cast<float*>(a.rendered), b.width, 1 << 30, 0},
+                           {const_cast<float*>(a.target), b.width, 1 << 30, 0}};
+  const Image maps[3] = {{ring, stride, kRing, around.x0},
+                         {ring + kRing * stride, stride, kRing, around.x0},
+                         {ring + 2 * kRing * stride, stride, kRing, around.x0}};
   Columns<4> ahead(around);
   Columns<3> columns(b);
   int next = around.y0;
   for (int y = b.y0; y < b.y1; y += 2) {
-    for (; next < around.y1 && next <= y + 1 + kRadius; next += 2) ssim_rows(ahead, around, next, images, maps, b, row_ssim);
+    for (; next < around.y1 && next <= y + 1 + kRadius; next += 2)
+      ssim_rows(ahead, around, next, images, maps, b, row_ssim);
     gradient_rows(columns, a, b, y, maps, row_l1);
   }
 }
 
 inline void photometric_stage(Pool& pool, PhotometricArguments& a) {
-  const int width = 3 * a.width, strip = divide_up(divide_up(width, divide_up(width, kStrip)), kWide) * kWide, strips = divide_up(width, strip);
+  const int width = 3 * a.width, strip = divide_up(divide_up(width, divide_up(width, kStrip)), kWide) * kWide,
+            strips = divide_up(width, strip);
   const int bands = pool.threads() == 1 ? 1 : 2 * pool.threads();
   const int rows = (a.height + 2 * bands - 1) / (2 * bands) * 2;  // even, so that no pair of rows is split
   constexpr int64_t kRingFloats = 3 * kRing * kRingStride;
   a.scratch->reserve(sizeof(float) * kRingFloats * pool.threads() + sizeof(double) * 2 * strips * a.height);
-  double *ssim = reinterpret_cast<double*>(a.scratch->as<float>() + kRingFloats * pool.threads()), *l1 = ssim + static_cast<int64_t>(strips) * a.height;
+  double *ssim = reinterpret_cast<double*>(a.scratch->as<float>() + kRingFloats * pool.threads()),
+         *l1 = ssim + static_cast<int64_t>(strips) * a.height;
   parallel(pool, bands * strips, [&](int item, int worker) {
     const int x0 = item % strips * strip, y0 = item / strips * rows;
-    const Band band = {y0, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < strip ? width - x0 : strip, width, a.height};
+    const Band band = {
+        y0, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < strip ? width - x0 : strip, width, a.height};
     const int64_t sums = static_cast<int64_t>(item % strips) * a.height;
     if (y0 < a.height) photometric_band(a, band, a.scratch->as<float>() + kRingFloats * worker, ssim + sums, l1 + sums);
   });
   a.ssim = a.l1 = 0;
-  for (int64_t k = 0; k < static_cast<int64_t>(strips) * a.height; ++k) a.ssim += ssim[k], a.l1 += l1[k];
+  for (int64_t k = 0; k < static_cast<int64_t>(strips) * a.height; ++k) {
+    a.ssim += ssim[k];
+    a.l1 += l1[k];
+  }
   const double size = static_cast<double>(width) * a.height;
-  a.ssim /= size, a.l1 /= size;
+  a.ssim /= size;
+  a.l1 /= size;
 }
 
 }  // namespace gsopt::GSOPT_ISA

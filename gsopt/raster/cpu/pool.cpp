@@ -98,7 +98,8 @@ void Pool::leave_core_of_caller(int worker, int& pinned) const {
     return;
   }
 #else
-  (void)worker, (void)pinned;
+  (void)worker;
+  (void)pinned;
 #endif
 }
 

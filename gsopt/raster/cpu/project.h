@@ -8,8 +8,8 @@
 
 namespace gsopt::GSOPT_ISA {
 
-// Gaussians are visited in their order, but in more arrays than a processor foresees: what this many further on will be read or
-// written is asked for. It may lie behind an array's end, where asking does no harm.
+// Gaussians are visited in their order, but in more arrays than a processor foresees: what this many further on will be
+// read or written is asked for. It may lie behind an array's end, where asking does no harm.
 constexpr int kGaussiansAhead = 24;
 
 // Three numbers of row n, and anything: four are read, but for the last of all rows, behind which there may be nothing.
@@ -30,7 +30,13 @@ inline Splat3D<wide> load_splats(const Parameters& P, const int64_t index[kWide]
   for (int l = 0; l < kWide; ++l) logits[l] = P.logit_opacities[index[l]];
   wide q[4];
   load_fours([&](int l) { return load4(P.quats + 4 * index[l]); }, q);
-  return {load_vec3(P.means, index, P.count), q[0], q[1], q[2], q[3], load_vec3(P.log_scales, index, P.count), load_wide(logits)};
+  return {load_vec3(P.means, index, P.count),
+          q[0],
+          q[1],
+          q[2],
+          q[3],
+          load_vec3(P.log_scales, index, P.count),
+          load_wide(logits)};
 }
 
 template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<F>& offset, F& inverse_distance) {
@@ -47,8 +53,8 @@ template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<
   for (int k = 0; k < (degree + 1) * (degree + 1) - 1; ++k) store_wide(Y[k], basis[k]);
 }
 
-// The first `bands` coefficients of shN of a vector of Gaussians: red, green and blue of one band after the other. The last eight
-// numbers are read from the end of a row, so that nothing behind it is.
+// The first `bands` coefficients of shN of a vector of Gaussians: red, green and blue of one band after the other. The
+// last eight numbers are read from the end of a row, so that nothing behind it is.
 inline void load_bands(const Parameters& P, const int64_t index[kWide], int bands, wide sh[3 * kMaxBands + 3]) {
   const int stride = 3 * P.sh_rest;
   for (int from = 0; from < 3 * bands; from += 8) {
@@ -62,7 +68,8 @@ inline void load_bands(const Parameters& P, const int64_t index[kWide], int band
   }
 }
 
-inline Vec3<wide> sh_color(const Frame& frame, const Parameters& P, const int64_t index[kWide], const Vec3<wide>& mean) {
+inline Vec3<wide> sh_color(const Frame& frame, const Parameters& P, const int64_t index[kWide],
+                           const Vec3<wide>& mean) {
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   alignas(64) float Y[kMaxBands][kWide];
   wide sh[3 * kMaxBands + 3];
@@ -84,9 +91,12 @@ struct Visible {
 // Records of a vector of splats, field by field; there is room for a full one.
 inline void write_records(Record* records, const wide (&field)[12]) {
   const auto four = [&](int f) {
-    store_fours({field[f], field[f + 1], field[f + 2], field[f + 3]}, [&](int l, f4 v) { store4(&records[l].mx + f, v); });
+    store_fours({field[f], field[f + 1], field[f + 2], field[f + 3]},
+                [&](int l, f4 v) { store4(&records[l].mx + f, v); });
   };
-  four(0), four(4), four(8);
+  four(0);
+  four(4);
+  four(8);
 }
 
 // The least whole number that is not less; 2^30 at most.
@@ -97,7 +107,8 @@ inline widei ceiling(wide x) {
 }
 
 // One vector of Gaussians.
-inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, Visible& visible) {
+inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii,
+                          Visible& visible) {
   const Camera& cam = frame.camera;
   int64_t index[kWide];
   for (int l = 0; l < kWide; ++l) index[l] = first + (l < lanes ? l : 0);
@@ -115,8 +126,8 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   const wide reach = max(lo - kLog2AlphaMin, splat<wide>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
   const wide rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
   const widei ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
-                (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) & (p.my + ry > 0.f) &
-                (p.my - ry < static_cast<float>(cam.height));
+                   (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) &
+                   (p.my + ry > 0.f) & (p.my - ry < static_cast<float>(cam.height));
   const int mask = movemask(ok) & ((1 << lanes) - 1);
   radii += 2 * first;
   if (!mask) {
@@ -127,28 +138,36 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   const TileBoxes boxes = tile_boxes(frame, p.mx, p.my, rx, ry, ok);
   const Vec3<wide> color = sh_color(frame, P, index, g.mean);
   write_records(records, {p.mx, p.my, A, B, C, lo, color.x, color.y, color.z, p.t.z,
-                from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
+                          from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
   alignas(64) int32_t box[4][kWide], tiles[2][kWide] = {}, radius[2][kWide], keys[kWide];
-  store_widei(box[0], boxes.x0), store_widei(box[1], boxes.x1), store_widei(box[2], boxes.y0), store_widei(box[3], boxes.y1);
-  store_widei(radius[0], ceiling(rx) & ok), store_widei(radius[1], ceiling(ry) & ok);
+  store_widei(box[0], boxes.x0);
+  store_widei(box[1], boxes.x1);
+  store_widei(box[2], boxes.y0);
+  store_widei(box[3], boxes.y1);
+  store_widei(radius[0], ceiling(rx) & ok);
+  store_widei(radius[1], ceiling(ry) & ok);
   store_widei(keys, bits(p.t.z));  // positive floats sort like their bits
   if (frame.skips.tiles) {
     const TileMasks masks = tile_masks(p.mx, p.my, A, B, C, lo, boxes);
-    store_widei(tiles[0], masks.low), store_widei(tiles[1], masks.high);
+    store_widei(tiles[0], masks.low);
+    store_widei(tiles[1], masks.high);
   }
   for (int l = 0; l < lanes; ++l) {
     const uint32_t id = static_cast<uint32_t>(first + l);
     const int seen = mask >> l & 1;
     const uint64_t touched = static_cast<uint32_t>(tiles[0][l]) | static_cast<uint64_t>(tiles[1][l]) << 32;
     covers[l] = seen ? cover_of(frame, id, {box[0][l], box[1][l], box[2][l], box[3][l]}, touched) : Cover{};
-    radii[2 * l] = radius[0][l], radii[2 * l + 1] = radius[1][l];
-    visible.ids[visible.found.visible] = id, visible.keys[visible.found.visible] = static_cast<uint32_t>(keys[l]);
+    radii[2 * l] = radius[0][l];
+    radii[2 * l + 1] = radius[1][l];
+    visible.ids[visible.found.visible] = id;
+    visible.keys[visible.found.visible] = static_cast<uint32_t>(keys[l]);
     visible.found.visible += seen;  // what was written is overwritten if not
     visible.found.intersections += covers[l].slot;
   }
 }
 
-// Fills records, covers and radii, and leaves ids and depth keys of the visible Gaussians, in index order, for the sort.
+// Fills records, covers and radii, and leaves ids and depth keys of the visible Gaussians, in index order, for the
+// sort.
 inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t* radii) {
   const int chunks = divide_up(P.count, kProjectChunk);
   uint32_t *ids = frame.order2.as<uint32_t>(), *keys = frame.keys2.as<uint32_t>();
@@ -157,14 +176,16 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
   parallel(pool, chunks, [&](int chunk, int) {
     const int64_t begin = static_cast<int64_t>(chunk) * kProjectChunk, end = end_of(begin);
     Visible visible = {ids + begin, keys + begin, {}};
-    for (int64_t i = begin; i < end; i += kWide) project_lanes(frame, P, i, end - i < kWide ? static_cast<int>(end - i) : kWide, radii, visible);
+    for (int64_t i = begin; i < end; i += kWide)
+      project_lanes(frame, P, i, end - i < kWide ? static_cast<int>(end - i) : kWide, radii, visible);
     found[chunk] = visible.found;
   });
   frame.visible = frame.intersections = 0;
   for (int chunk = 0; chunk < chunks; ++chunk) {  // from here on: what came before
     const Found mine = found[chunk];
     found[chunk] = {static_cast<uint32_t>(frame.visible), frame.intersections};
-    frame.visible += mine.visible, frame.intersections += mine.intersections;
+    frame.visible += mine.visible;
+    frame.intersections += mine.intersections;
   }
   Cover* covers = frame.covers.as<Cover>();
   parallel(pool, chunks, [&](int chunk, int) {
@@ -175,14 +196,15 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
     uint32_t slot = static_cast<uint32_t>(found[chunk].intersections);
     for (int64_t i = begin; i < end; ++i) {
       const uint32_t count = covers[i].slot;
-      covers[i].slot = slot, slot += count;
+      covers[i].slot = slot;
+      slot += count;
     }
   });
   covers[P.count].slot = static_cast<uint32_t>(frame.intersections);
 }
 
-// Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 at `row`, but for bands that are not drawn. Writes one float more, which is the
-// next row's or spare.
+// Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 at `row`, but for bands that are not drawn. Writes one float more,
+// which is the next row's or spare.
 inline void bands_gradient(const float* v_sh0, int64_t n, int bands, const float (*Y)[kWide], int lane, float* row) {
   const float* v = v_sh0 + 3 * n;
   const f4 v_color = f4{v[0], v[1], v[2], 0.f} * (1.f / kSH0);

@@ -18,19 +18,22 @@ inline Vec3<wide> color_gradient(const Frame& frame, const int64_t index[kWide],
 }
 
 // dLoss/d(direction), before normalisation.
-inline Vec3<wide> sh_backward(const Parameters& P, const int64_t index[kWide], int degree, const Vec3<wide>& d, const Vec3<wide>& v_color) {
+inline Vec3<wide> sh_backward(const Parameters& P, const int64_t index[kWide], int degree, const Vec3<wide>& d,
+                              const Vec3<wide>& v_color) {
   const int bands = (degree + 1) * (degree + 1) - 1;
   wide sh[3 * kMaxBands + 3], Yx[kMaxBands], Yy[kMaxBands], Yz[kMaxBands];
   load_bands(P, index, bands, sh);
   sh_basis_gradient(degree, d.x, d.y, d.z, Yx, Yy, Yz);
   const wide zero = splat<wide>(0.f);
   Vec3<wide> out = {zero, zero, zero};
-  for (int k = 0; k < bands; ++k) out = out + Vec3<wide>{Yx[k], Yy[k], Yz[k]} * dot(v_color, {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]});
+  for (int k = 0; k < bands; ++k)
+    out = out + Vec3<wide>{Yx[k], Yy[k], Yz[k]} * dot(v_color, {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]});
   return out;
 }
 
 // dLoss/d(shN) of a vector of Gaussians whose dLoss/d(sh0) is written.
-inline void write_bands_gradient(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kWide], const Vec3<wide>& mean) {
+inline void write_bands_gradient(const Frame& frame, const Parameters& P, const ParameterGradients& G,
+                                 const int64_t index[kWide], const Vec3<wide>& mean) {
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   alignas(64) float Y[kMaxBands][kWide];
   view_basis(frame.camera, mean, frame.sh_degree, Y);
@@ -50,13 +53,17 @@ inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
     for (int h = 0; h < kRow / kWide; ++h) sum[h] += load_wide(row + h * kWide);
   }
   widei nonzero = splat_widei(0);
-  for (int h = 0; h < kRow / kWide; ++h) store_wide(out + h * kWide, sum[h]), nonzero |= sum[h] != 0.f;
+  for (int h = 0; h < kRow / kWide; ++h) {
+    store_wide(out + h * kWide, sum[h]);
+    nonzero |= sum[h] != 0.f;
+  }
   return any(nonzero);
 }
 
-// A full vector, always: a compiler that knew how many lanes count would round otherwise for whole vectors than for the last one.
-inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G, const int64_t index[kWide],
-                                   const float sums[kWide][kRow]) {
+// A full vector, always: a compiler that knew how many lanes count would round otherwise for whole vectors than for the
+// last one.
+inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G,
+                                   const int64_t index[kWide], const float sums[kWide][kRow]) {
   const Camera& cam = frame.camera;
   wide field[kRow];
   for (int h = 0; h < kRow; h += 8) load_eights([&](int l) { return load8(sums[l] + h); }, field + h);
@@ -66,8 +73,15 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   // Blending measures u and v in units of sqrt(kHalfLog2E).
   constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
   const wide su = field[kSu] * length, sv = field[kSv] * length;
-  const SplatGradient<wide> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
-                               L.A * su, L.B * su + L.C * sv, field[kWz]};
+  const SplatGradient<wide> v = {su,
+                                 sv,
+                                 field[kSuu] * square,
+                                 field[kSuv] * square,
+                                 field[kSvv] * square,
+                                 field[kS],
+                                 L.A * su,
+                                 L.B * su + L.C * sv,
+                                 field[kWz]};
   Splat3D<wide> out = project_backward(cam, p, L, v);
 
   wide inv;
@@ -77,14 +91,16 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   out.mean = out.mean + (u - d * dot(u, d)) * inv;
   if (G.shN) write_bands_gradient(frame, P, G, index, g.mean);
 
-  store_vec3(G.means, index, out.mean), store_vec3(G.log_scales, index, out.log_scale);
+  store_vec3(G.means, index, out.mean);
+  store_vec3(G.log_scales, index, out.log_scale);
   store_fours({out.qw, out.qx, out.qy, out.qz}, [&](int l, f4 v) { store4(G.quats + 4 * index[l], v); });
   alignas(64) float logits[kWide];
   store_wide(logits, out.logit);
   for (int l = 0; l < kWide; ++l) G.logit_opacities[index[l]] = logits[l];
   store_fours({v.mx, v.my, field[kAbsX], field[kAbsY]}, [&](int l, f4 v2) {
     std::memcpy(G.means2d + 2 * index[l], &v2, sizeof(float) * 2);
-    if (G.means2d_abs) std::memcpy(G.means2d_abs + 2 * index[l], reinterpret_cast<const float*>(&v2) + 2, sizeof(float) * 2);
+    if (G.means2d_abs)
+      std::memcpy(G.means2d_abs + 2 * index[l], reinterpret_cast<const float*>(&v2) + 2, sizeof(float) * 2);
   });
 }
 
@@ -102,7 +118,8 @@ inline void ask_for_gradient(const Frame& frame, const ParameterGradients& G, in
   __builtin_prefetch(&frame.records.as<Record>()[n].r);
   if (n % 4) return;
   for (const float* to : {G.means, G.log_scales, G.sh0}) __builtin_prefetch(to + 3 * n, 1);
-  __builtin_prefetch(G.quats + 4 * n, 1), __builtin_prefetch(G.means2d + 2 * n, 1);
+  __builtin_prefetch(G.quats + 4 * n, 1);
+  __builtin_prefetch(G.means2d + 2 * n, 1);
 }
 
 // Gaussians that no pixel saw get zeros; the others are packed into full vectors, in index order.
@@ -121,10 +138,16 @@ inline void project_backward_stage(Pool& pool, Frame& frame, const Parameters& P
         continue;
       }
       index[lanes++] = n;
-      if (lanes == kWide) project_backward_lanes(frame, P, G, index, sums), lanes = 0;
+      if (lanes == kWide) {
+        project_backward_lanes(frame, P, G, index, sums);
+        lanes = 0;
+      }
     }
     if (lanes) {
-      for (int l = lanes; l < kWide; ++l) index[l] = index[0], std::memcpy(sums[l], sums[0], sizeof(sums[0]));
+      for (int l = lanes; l < kWide; ++l) {
+        index[l] = index[0];
+        std::memcpy(sums[l], sums[0], sizeof(sums[0]));
+      }
       project_backward_lanes(frame, P, G, index, sums);
     }
   });

@@ -1,7 +1,6 @@
-// Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the language has no
-// operator. 8 lanes, or with GSOPT_SIXTEEN 16, hold the pixels of a block (`px`) and Gaussians and whatever else is as wide as it
-// can be (`wide`).
-// Included once per instruction set; everything lives in that set's own namespace.
+// Vectors of 4, 8 and 16 lanes from one source: GCC/Clang vector extensions, with an intrinsic only where the language
+// has no operator. 8 lanes, or with GSOPT_SIXTEEN 16, hold the pixels of a block (`px`) and Gaussians and whatever else
+// is as wide as it can be (`wide`). Included once per instruction set; everything lives in that set's own namespace.
 #pragma once
 #include <bit>
 #include <cmath>
@@ -102,7 +101,9 @@ inline f16 select(i16 m, f16 a, f16 b) { return m ? a : b; }
 inline i16 select(i16 m, i16 a, i16 b) { return m ? a : b; }
 inline f16 to_float(i16 v) { return __builtin_convertvector(v, f16); }
 inline i16 to_int(f16 v) { return __builtin_convertvector(v, i16); }  // truncates
-inline f16 joined(f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
+inline f16 joined(f8 a, f8 b) {
+  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+}
 inline f16 abs(f16 a) { return (f16)((i16)a & splat16i(0x7fffffff)); }
 inline i16 shift_exponent(i16 n) { return n << 23; }
 inline f8 low_half(f16 a) { return __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7); }
@@ -120,7 +121,8 @@ inline f16 sqrt(f16 a) { return joined(sqrt(low_half(a)), sqrt(high_half(a))); }
 inline f16 sqrt_near(f16 a) { return joined(sqrt_near(low_half(a)), sqrt_near(high_half(a))); }
 inline f16 max(f16 a, f16 b) { return joined(max(low_half(a), low_half(b)), max(high_half(a), high_half(b))); }
 inline i16 shift_left(i16 a, i16 n) {
-  return (i16)joined((f8)shift_left((i8)low_half((f16)a), (i8)low_half((f16)n)), (f8)shift_left((i8)high_half((f16)a), (i8)high_half((f16)n)));
+  return (i16)joined((f8)shift_left((i8)low_half((f16)a), (i8)low_half((f16)n)),
+                     (f8)shift_left((i8)high_half((f16)a), (i8)high_half((f16)n)));
 }
 inline f16 min(f16 a, f16 b) { return joined(min(low_half(a), low_half(b)), min(high_half(a), high_half(b))); }
 inline i16 max(i16 a, i16 b) { return a > b ? a : b; }
@@ -175,27 +177,32 @@ template <class V> inline V exp2(V x) {
 }
 
 #if defined(GSOPT_SIXTEEN) && defined(__AVX512F__)
-// The same from a table of 2^(i/32), i the low bits of round(32 x), and a polynomial of degree 2 on [-1/64, 1/64]: fewer steps,
-// where one instruction looks up 16 of 32 numbers. The other bits of round(32 x), shifted into the exponent, bring i along
-// into the mantissa; the table has it subtracted.
+// The same from a table of 2^(i/32), i the low bits of round(32 x), and a polynomial of degree 2 on [-1/64, 1/64]:
+// fewer steps, where one instruction looks up 16 of 32 numbers. The other bits of round(32 x), shifted into the
+// exponent, bring i along into the mantissa; the table has it subtracted.
 struct ExpTable {
   int32_t of[32];
   constexpr ExpTable() : of() {
     double power = 1;
-    for (int i = 0; i < 32; ++i, power *= 1.0218971486541166) of[i] = std::bit_cast<int32_t>(static_cast<float>(power)) - (i << 18);
+    for (int i = 0; i < 32; ++i, power *= 1.0218971486541166)
+      of[i] = std::bit_cast<int32_t>(static_cast<float>(power)) - (i << 18);
   }
 };
 inline constexpr ExpTable kExpTable;
 template <> inline f16 exp2<f16>(f16 x) {
-  const i16 low = *reinterpret_cast<const i16u*>(kExpTable.of), high = *reinterpret_cast<const i16u*>(kExpTable.of + 16);
+  const i16 low = *reinterpret_cast<const i16u*>(kExpTable.of),
+            high = *reinterpret_cast<const i16u*>(kExpTable.of + 16);
   const f16 magic = splat<f16>(393216.f);  // 1.5 * 2^18
   const f16 shifted = x + magic, f = x - (shifted - magic);
-  const f16 power = from_bits((i16)_mm512_permutex2var_epi32((__m512i)low, (__m512i)bits(shifted), (__m512i)high) + (bits(shifted) << 18));
+  const f16 power = from_bits((i16)_mm512_permutex2var_epi32((__m512i)low, (__m512i)bits(shifted), (__m512i)high) +
+                              (bits(shifted) << 18));
   return power + power * (f * (f * splat<f16>(2.402265e-01f) + splat<f16>(6.9315733e-01f)));
 }
 #endif
 
-template <class V> inline V exp(V x) { return exp2(clamp(x * splat<V>(1.44269504089f), splat<V>(-125.f), splat<V>(125.f))); }
+template <class V> inline V exp(V x) {
+  return exp2(clamp(x * splat<V>(1.44269504089f), splat<V>(-125.f), splat<V>(125.f)));
+}
 
 // log2(x) for normal x > 0: x = 2^k m with m in [sqrt(1/2), sqrt(2)), then the series of atanh((m-1)/(m+1)).
 template <class V> inline V log2(V x) {

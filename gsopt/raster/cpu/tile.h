@@ -27,8 +27,8 @@ inline TileGeometry tile_geometry(const Frame& frame, int tile) {
           static_cast<float>(tile / frame.tiles_x * kTile + kTile / 2)};
 }
 
-// Records lie anywhere in memory: those of entries [begin, end) of the frame are asked for long before they are needed, into
-// the second cache; `load_chunk` asks again, for the first.
+// Records lie anywhere in memory: those of entries [begin, end) of the frame are asked for long before they are needed,
+// into the second cache; `load_chunk` asks again, for the first.
 inline void prefetch_records(const Frame& frame, int64_t begin, int64_t end) {
   const Entry* entries = frame.entries.as<Entry>();
   const Record* records = frame.records.as<Record>();
@@ -36,7 +36,8 @@ inline void prefetch_records(const Frame& frame, int64_t begin, int64_t end) {
   for (int64_t k = begin > 0 ? begin : 0; k < end; ++k) __builtin_prefetch(&records[entries[k].id], 0, 2);
 }
 
-// Calls body(k, worker) for k = 0 ... tiles - 1. A worker gets several in a row, because a tile asks for the records of the next.
+// Calls body(k, worker) for k = 0 ... tiles - 1. A worker gets several in a row, because a tile asks for the records of
+// the next.
 template <class Body> inline void for_each_tile_of(Pool& pool, const Frame& frame, Body&& body) {
   const int fair = frame.tiles() / (16 * pool.threads()), run = fair < 1 ? 1 : (fair < 16 ? fair : 16);
   parallel(pool, divide_up(frame.tiles(), run), [&](int item, int worker) {
@@ -51,7 +52,8 @@ inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeom
     __builtin_prefetch(&records[entries[i + kRecordsAhead < n ? i + kRecordsAhead : i].id]);
     const Record& r = records[entries[i].id];
     store8(&local.row[i].x, load8(&r.mx) - origin);
-    local.b[i] = r.b, local.depth[i] = r.depth;
+    local.b[i] = r.b;
+    local.depth[i] = r.depth;
   }
 }
 
@@ -68,11 +70,14 @@ struct alignas(64) BlockPixels {
 };
 inline constexpr BlockPixels kBlockPixels;
 
-// Calls visit(pixel of the image, lane, n) for the rows of a block, each the n <= 4 of its pixels that lie inside the image.
+// Calls visit(pixel of the image, lane, n) for the rows of a block, each the n <= 4 of its pixels that lie inside the
+// image.
 template <class Visit> inline void for_each_row(const Frame& frame, int tile, int block, Visit&& visit) {
-  const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4), y0 = tile / frame.tiles_x * kTile + kBlockRows * (block / 4);
+  const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4),
+            y0 = tile / frame.tiles_x * kTile + kBlockRows * (block / 4);
   const int w = frame.camera.width, h = frame.camera.height, n = w - x0 < 4 ? w - x0 : 4;
-  for (int row = 0; n > 0 && row < kBlockRows && y0 + row < h; ++row) visit(static_cast<int64_t>(y0 + row) * w + x0, 4 * row, n);
+  for (int row = 0; n > 0 && row < kBlockRows && y0 + row < h; ++row)
+    visit(static_cast<int64_t>(y0 + row) * w + x0, 4 * row, n);
 }
 
 // The first n of four floats, and of four pixels of interleaved RGB; zeros instead of the others.
