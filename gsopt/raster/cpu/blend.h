@@ -14,18 +14,14 @@ struct alignas(64) BlockState {
   int32_t last[kPixels];  // number in the tile, from 1, of the last splat that found it not opaque; 0 if none
 };
 
-// The alphas of n splats at the pixels of a block; 0 where they are not drawn.
+// The alphas (7) of n splats at the pixels of a block; 0 where they are not drawn.
 inline void alphas_of(const Local& local, const Touched& touched, const uint8_t* list, int n, int block,
                       px alphas[kBatch]) {
   const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
-  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
   for (int j = 0; j < n; ++j) {
     const int i = list[j];
-    const Local::Row& s = local.row[i];
-    const px u = splat<px>(s.A) * X + (splat<px>(s.B) * Y + splat<px>(touched.u0[i])),
-             v = splat<px>(s.C) * Y + splat<px>(touched.v0[i]);
-    const px e = splat<px>(s.log2_opacity) - v * v - u * u;
-    alphas[j] = keep(e >= threshold, min(exp2(e), alpha_max));
+    Whitened<px> at;
+    alphas[j] = alpha_of(exponent(Spread(local.row[i], touched.u0[i], touched.v0[i]), X, Y, at));
   }
 }
 

@@ -36,38 +36,18 @@ inline void load_gradient(const Frame& frame, const BackwardInput& in, int tile,
   });
 }
 
-// One splat with its numbers spread over the lanes, and its exponent at a block's pixels:
-// exponent(X, Y) = log2_opacity - (A X + B Y + u0)² - (C Y + v0)²
-struct Spread {
-  px A, B, C, u0, v0, log2_opacity;
-  explicit Spread(const Local::Row& r)
-      : A(splat<px>(r.A)), B(splat<px>(r.B)), C(splat<px>(r.C)), u0(splat<px>(-(r.A * r.x + r.B * r.y))),
-        v0(splat<px>(-r.C * r.y)), log2_opacity(splat<px>(r.log2_opacity)) {}
-};
-struct Exponent {
-  px u, v, e;
-};
-inline Exponent exponent(const Spread& s, int block) {
-  const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
-  Exponent out;
-  out.u = s.A * X + (s.B * Y + s.u0);
-  out.v = s.C * Y + s.v0;
-  out.e = s.log2_opacity - out.v * out.v - out.u * out.u;  // v is ready first
-  return out;
-}
-
 // The alphas of one splat at the pixels of the blocks of a mask, one block after the other; 0 where they are not drawn.
 struct Alphas {
-  px alpha[kBlocks], u[kBlocks], v[kBlocks];
+  px alpha[kBlocks];
+  Whitened<px> at[kBlocks];
 };
-inline void alphas_of(const Spread& splat_i, uint32_t mask, Alphas& out) {
-  const px threshold = splat<px>(kLog2AlphaMin), alpha_max = splat<px>(kAlphaMax);
+inline void alphas_of(const Local::Row& s, uint32_t mask, Alphas& out) {
+  const Whitened<float> center = at_center(s.A, s.B, s.C, s.x, s.y);
+  const Spread spread(s, center.u, center.v);
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
-    const Exponent x = exponent(splat_i, __builtin_ctz(rest));
-    out.alpha[n] = keep(x.e >= threshold, min(exp2(x.e), alpha_max));
-    out.u[n] = x.u;
-    out.v[n] = x.v;
+    const int block = __builtin_ctz(rest);
+    out.alpha[n] = alpha_of(exponent(spread, load_px(kBlockPixels.x[block]), load_px(kBlockPixels.y[block]), out.at[n]));
   }
 }
 
@@ -82,7 +62,7 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
   const px one = splat<px>(1.f), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
-  alphas_of(Spread(splat_i), mask, alphas);
+  alphas_of(splat_i, mask, alphas);
   px wr = zero, wg = zero, wb = zero, wz = zero, s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero,
      abs_x = zero, abs_y = zero;
   int n = 0;
@@ -100,7 +80,7 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
     wb = wb + weight * gb;
     if (Depth) wz = wz + weight * load_px(p.depth);
     const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
-    const px u = alphas.u[n], v = alphas.v[n], s_u = s * u, s_v = s * v;
+    const px u = alphas.at[n].u, v = alphas.at[n].v, s_u = s * u, s_v = s * v;
     s0 = s0 + s;
     su = su + s_u;
     sv = sv + s_v;

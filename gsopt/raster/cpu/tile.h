@@ -1,5 +1,5 @@
 // What forward and backward share inside one tile: splats in tile coordinates, and its pixels in blocks of 4x2 or 4x4.
-// Coordinates are relative to the tile's centre, so the numbers stay small wherever the tile lies in the image.
+// Coordinates are relative to the tile's center, so the numbers stay small wherever the tile lies in the image.
 #pragma once
 #include "columns.h"
 #include "frame.h"
@@ -10,7 +10,7 @@ namespace gsopt::GSOPT_ISA {
 constexpr int kRecordsAhead = 16;  // splats of a tile lie anywhere in memory: ask for them early
 constexpr int kBlockRows = kPixels / 4, kStrips = kTile / kBlockRows;
 
-// The splats of a chunk as their records begin, x and y from the tile's centre.
+// The splats of a chunk as their records begin, x and y from the tile's center.
 struct Local {
   struct alignas(32) Row {
     float x, y, A, B, C, log2_opacity, r, g;
@@ -20,7 +20,7 @@ struct Local {
 };
 
 struct TileGeometry {
-  float x, y;  // its centre, px
+  float x, y;  // its center, px
 };
 inline TileGeometry tile_geometry(const Frame& frame, int tile) {
   return {static_cast<float>(tile % frame.tiles_x * kTile + kTile / 2),
@@ -57,7 +57,7 @@ inline void load_chunk(const Frame& frame, const Entry* entries, int n, TileGeom
   }
 }
 
-// The pixel coordinates of every block's lanes, rows of four, from the tile's centre.
+// The pixel coordinates of every block's lanes, rows of four, from the tile's center.
 struct alignas(64) BlockPixels {
   float x[kBlocks][kPixels], y[kBlocks][kPixels];
   constexpr BlockPixels() : x(), y() {
@@ -69,6 +69,29 @@ struct alignas(64) BlockPixels {
   }
 };
 inline constexpr BlockPixels kBlockPixels;
+
+// A splat's whitened coordinates, in units in which its exponent is log2_opacity - u² - v² (docs/math.md, 8a).
+template <class F> struct Whitened {
+  F u, v;
+};
+// Those of the tile's center, the splat's center being at (x, y) from it.
+template <class F> inline Whitened<F> at_center(F A, F B, F C, F x, F y) { return {-(A * x + B * y), -(C * y)}; }
+
+// A splat in every lane, and its exponent at the pixels of a block.
+struct Spread {
+  px A, B, C, u0, v0, log2_opacity;
+  Spread(const Local::Row& s, float u0, float v0)
+      : A(splat<px>(s.A)), B(splat<px>(s.B)), C(splat<px>(s.C)), u0(splat<px>(u0)), v0(splat<px>(v0)),
+        log2_opacity(splat<px>(s.log2_opacity)) {}
+};
+inline px exponent(const Spread& s, px X, px Y, Whitened<px>& at) {
+  at.u = s.A * X + (s.B * Y + s.u0);
+  at.v = s.C * Y + s.v0;
+  return s.log2_opacity - at.v * at.v - at.u * at.u;  // v is ready first
+}
+
+// alpha of (7).
+inline px alpha_of(px exponent) { return keep(exponent >= splat<px>(kLog2AlphaMin), min(exp2(exponent), splat<px>(kAlphaMax))); }
 
 // Calls visit(pixel of the image, lane, n) for the rows of a block, each the n <= 4 of its pixels that lie inside the
 // image.

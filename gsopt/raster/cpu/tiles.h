@@ -5,11 +5,11 @@
 // that of its rightmost point, y_r = -B/C sqrt(t / (B² + C²)); its left end mirrors that. Tile x holds the pixel
 // centres 16 x + 0.5 ... 16 x + 15.5.
 #pragma once
-#include "frame.h"
-#include "simd.h"
+#include "reach.h"
 
 namespace gsopt::GSOPT_ISA {
 
+constexpr float kMaskExtent = 9 * kTile;  // px: such a box and a tile
 constexpr int kMaskSide = 8;  // boxes of at most 8x8 tiles carry a mask: bit 8 row + column, relative to (x0, y0)
 
 struct TileBox {
@@ -30,6 +30,21 @@ inline TileBoxes tile_boxes(const Frame& frame, wide mx, wide my, wide rx, wide 
           within((my - ry) * inv, frame.tiles_y), within((my + ry) * inv + 1.f, frame.tiles_y)};
 }
 
+// Where the ellipse ends in the kTile rows from `top` on, in x as the center has it; `mx` is the center in the image.
+template <class F> struct StripEnds {
+  F left, right, square;  // square: negative where the ellipse does not reach the rows
+
+  StripEnds(const Reach<F>& reach, F rightmost, F top, F x, F mx, float extent) {
+    const F bottom = top + (kTile - 1.f), zero = splat<F>(0.f);
+    const F y_right = clamp(rightmost, top, bottom), y_left = clamp(-rightmost, top, bottom);
+    const F square_right = reach.square(y_right), square_left = reach.square(y_left);
+    const F margin = reach.margin(mx, max(abs(y_right), abs(y_left)), extent);
+    right = x - reach.slope * y_right + sqrt(max(square_right, zero)) * reach.width + margin;
+    left = x - reach.slope * y_left - sqrt(max(square_left, zero)) * reach.width - margin;
+    square = max(square_right, square_left);
+  }
+};
+
 // Which tiles of their boxes a vector of splats touches, rows 0 to 3 and 4 to 7; of a box that is larger the result is
 // arbitrary.
 struct TileMasks {
@@ -39,25 +54,18 @@ inline TileMasks tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, c
   const widei columns = boxes.x1 - boxes.x0, rows = boxes.y1 - boxes.y0, one = splat_widei(1),
               inside = shift_left(one, columns) - one;
   const int highest = most(rows & (columns <= kMaskSide) & (rows <= kMaskSide));
-  const wide zero = splat<wide>(0.f), t = (lo - kLog2AlphaMin) * 1.0001f + 1e-3f, iA = splat<wide>(1.f) / A,
-             slope = B * iA;
-  const wide extreme = zero - B / C * sqrt(max(t, zero) / (B * B + C * C));
-  const wide x = mx - to_float(boxes.x0) * static_cast<float>(kTile),
-             first_row = to_float(boxes.y0) * static_cast<float>(kTile) + 0.5f - my;
+  const Reach<wide> reach(A, B, C, lo);
+  const wide rightmost = reach.rightmost(), x = mx - to_float(boxes.x0) * static_cast<float>(kTile),
+             first_row = to_float(boxes.y0) * static_cast<float>(kTile) + 0.5f - my, zero = splat<wide>(0.f);
+  const auto whole = [&](wide tiles) { return to_int(clamp(tiles, zero, splat<wide>(kMaskSide + 0.5f))); };
   TileMasks out = {splat_widei(0), splat_widei(0)};
   for (int row = 0; row < highest; ++row) {
-    const wide top = first_row + static_cast<float>(row * kTile), bottom = top + (kTile - 1.f);
-    const wide yr = clamp(extreme, top, bottom), yl = clamp(zero - extreme, top, bottom);
-    const wide cr = C * yr, cl = C * yl, sr = t - cr * cr, sl = t - cl * cl;
-    const wide margin = (abs(slope * yr) + abs(mx)) * 2e-6f + 0.02f;
-    const wide right = x - slope * yr + sqrt(max(sr, zero)) * iA + margin;
-    const wide left = x - slope * yl - sqrt(max(sl, zero)) * iA - margin;
-    const widei behind = to_int(clamp((right + (kTile - 0.5f)) * (1.f / kTile), zero, splat<wide>(kMaskSide + 0.5f)));
+    const StripEnds<wide> ends(reach, rightmost, first_row + static_cast<float>(row * kTile), x, mx, kMaskExtent);
+    const widei behind = whole((ends.right + (kTile - 0.5f)) * (1.f / kTile));
     const widei first =
-        splat_widei(kMaskSide) - to_int(clamp(splat<wide>(kMaskSide) - (left - (kTile - 0.5f)) * (1.f / kTile), zero,
-                                              splat<wide>(kMaskSide + 0.5f)));
-    const widei touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside &
-                          ((sr >= 0.f) | (sl >= 0.f)) & (rows > row);
+        splat_widei(kMaskSide) - whole(splat<wide>(kMaskSide) - (ends.left - (kTile - 0.5f)) * (1.f / kTile));
+    const widei touched =
+        (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside & (ends.square >= 0.f) & (rows > row);
     (row < 4 ? out.low : out.high) |= touched << (kMaskSide * (row % 4));
   }
   return out;
@@ -66,22 +74,15 @@ inline TileMasks tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, c
 struct Span {
   int x0, x1;  // half open
 };
-// The tiles of row y that a splat touches. Not inlined: those who count tiles and those who list them must agree to the
-// bit.
+// The tiles of row y that a splat touches. Not inlined: counting tiles and listing them must agree to the bit.
 [[gnu::noinline]] inline Span tiles_of_row(const Record& r, int y) {
-  const float t = (r.log2_opacity - kLog2AlphaMin) * 1.0001f + 1e-3f;
-  const float iA = 1.f / r.A, slope = r.B * iA;
-  const float extreme = -(r.B / r.C) * __builtin_sqrtf(t / (r.B * r.B + r.C * r.C));
-  const auto limit = [](float v, float lo, float hi) { return v < lo ? lo : (v > hi ? hi : v); };
-  const float top = static_cast<float>(y * kTile) + 0.5f - r.my, bottom = top + (kTile - 1);
-  const float yr = limit(extreme, top, bottom), yl = limit(-extreme, top, bottom);
-  const float sr = t - r.C * yr * (r.C * yr), sl = t - r.C * yl * (r.C * yl);
-  if (sr < 0.f && sl < 0.f) return {0, 0};
-  const float margin = 0.02f + 2e-6f * (__builtin_fabsf(slope * yr) + __builtin_fabsf(r.mx));
-  const float right = r.mx - slope * yr + __builtin_sqrtf(sr > 0.f ? sr : 0.f) * iA + margin;
-  const float left = r.mx - slope * yl - __builtin_sqrtf(sl > 0.f ? sl : 0.f) * iA - margin;
-  const int x0 = static_cast<int>(__builtin_ceilf(limit((left - (kTile - 0.5f)) * (1.f / kTile), -1.f, 65536.f)));
-  const int x1 = static_cast<int>(__builtin_floorf(limit((right - 0.5f) * (1.f / kTile), -1.f, 65536.f))) + 1;
+  const Reach<float> reach(r.A, r.B, r.C, r.log2_opacity);
+  const float top = static_cast<float>(y * kTile) + 0.5f - r.my;
+  const StripEnds<float> ends(reach, reach.rightmost(), top, r.mx, r.mx, static_cast<float>((r.x1 + 1) * kTile));
+  if (!(ends.square >= 0.f)) return {0, 0};
+  const auto tile = [](float x) { return clamp(x * (1.f / kTile), -1.f, 65536.f); };
+  const int x0 = static_cast<int>(__builtin_ceilf(tile(ends.left - (kTile - 0.5f))));
+  const int x1 = static_cast<int>(__builtin_floorf(tile(ends.right - 0.5f))) + 1;
   return {x0 > r.x0 ? x0 : r.x0, x1 < r.x1 ? x1 : r.x1};
 }
 
