@@ -82,10 +82,11 @@ class CpuBackend:
         colors, alphas = torch.empty(height, width, 3), torch.empty(height, width)
         depths = torch.empty(height, width) if depth else None
         radii = torch.empty(n, 2, dtype=torch.int32)
-        behind = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
+        image = _cpu.Image(colors, alphas, depths, radii)
+        behind = (0.0, 0.0, 0.0) if background is None else background.tolist()
         degree = min(settings.sh_degree, gaussians.sh_degree)
         try:
-            _cpu.forward(self._workspace, frame, model, degree, view, behind, colors, alphas, depths, radii)
+            _cpu.forward(self._workspace, frame, model, view, image, sh_degree=degree, background=behind)
         except (MemoryError, OverflowError) as error:
             raise NumericalError(
                 f"Drawing {n:,} Gaussians at {width}x{height} needs more memory than there is: {error}. Draw fewer or "
@@ -142,12 +143,18 @@ class CpuBackend:
         settings: RasterSettings,
     ) -> None:
         """See `Backend.adam`. All tensors must be float32 and contiguous."""
-        model, m, v = (_model(record) for record in (gaussians, exp_avg, exp_avg_sq))
-        out = _gradient(gradients)
         rates = [step.lr.get(name, 0.0) for name in PARAMETERS]
         steps = [step.steps[name] if name in step.lr else 0 for name in PARAMETERS]
-        view, degree = self._views.of(camera, settings), min(settings.sh_degree, gaussians.sh_degree)
-        _cpu.adam(self._workspace, model, out, m, v, rates, steps, step.beta1, step.beta2, step.eps, view, degree)
+        _cpu.adam(
+            self._workspace,
+            _model(gaussians),
+            _gradient(gradients),
+            exp_avg=_model(exp_avg),
+            exp_avg_sq=_model(exp_avg_sq),
+            step=_cpu.AdamStep(lr=rates, steps=steps, beta1=step.beta1, beta2=step.beta2, eps=step.eps),
+            camera=self._views.of(camera, settings),
+            sh_degree=min(settings.sh_degree, gaussians.sh_degree),
+        )
 
 
 def _model(record: Gaussians) -> Any:

@@ -1,6 +1,6 @@
 // From a Gaussian in the world to a splat on the image plane, and the gradient on the way back.
 // F = float (one thread, one Gaussian) or a vector of floats; the including file provides sqrt, min, max, clamp,
-// select, exp, log2 and splat for F. Equations: docs/math.md, section "Projection".
+// select, exp, log2 and splat for F. Numbers in parentheses are equations of docs/math.md.
 #pragma once
 #include "constants.h"
 
@@ -35,7 +35,7 @@ template <class F> inline Vec3<F> cross(Vec3<F> a, Vec3<F> b) {
 }
 template <class F> inline Vec3<F> splat3(const float* p) { return {splat<F>(p[0]), splat<F>(p[1]), splat<F>(p[2])}; }
 
-// Columns of the rotation of a unit quaternion (w, x, y, z).
+// Columns of the rotation of a unit quaternion (w, x, y, z), (3).
 template <class F> struct Rotation {
   Vec3<F> c0, c1, c2;
 };
@@ -46,7 +46,7 @@ template <class F> inline Rotation<F> rotation(F w, F x, F y, F z) {
           {(x * z + w * y) * 2.f, (y * z - w * x) * 2.f, one - (x * x + y * y) * 2.f}};
 }
 
-// One Gaussian (or a vector of them) as the optimiser stores it.
+// One Gaussian (or a vector of them) as the optimizer stores it.
 template <class F> struct Splat3D {
   Vec3<F> mean;
   F qw, qx, qy, qz;
@@ -56,13 +56,13 @@ template <class F> struct Splat3D {
 
 // Everything that forward and backward both need.
 template <class F> struct Projected {
-  Vec3<F> offset;        // mean - pivot
-  Vec3<F> t;             // camera space
-  F iz, ux, uy, vx, vy;  // 1/t_z; t_x/t_z, t_y/t_z; the same clamped
-  F qn, qw, qx, qy, qz;  // norm of the quaternion, unit quaternion
+  Vec3<F> offset;                        // mean - pivot
+  Vec3<F> t;                             // camera space
+  F iz, ray_x, ray_y, bound_x, bound_y;  // 1/t_z; t_x/t_z, t_y/t_z; the same clamped
+  F qn, qw, qx, qy, qz;                  // norm of the quaternion, unit quaternion
   Rotation<F> R;
   Vec3<F> scale;
-  Vec3<F> T0, T1;           // rows of J W
+  Vec3<F> JW0, JW1;         // rows of J W
   Vec3<F> M0, M1;           // rows of J W R S: cov2d = M Mᵀ + eps2d
   F mx, my, xx, xy, yy;     // mean2d and cov2d
   F det0, det;              // determinants of M Mᵀ and of cov2d
@@ -71,20 +71,21 @@ template <class F> struct Projected {
   F sigmoid, transparency;  // of the logit; 1 - sigmoid without a difference
 };
 
+// Equations (1) to (5).
 template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<F>& g) {
   Projected<F> p;
   const Vec3<F> W0 = splat3<F>(cam.R), W1 = splat3<F>(cam.R + 3), W2 = splat3<F>(cam.R + 6);
   p.offset = g.mean - splat3<F>(cam.pivot);
   p.t = {dot(W0, p.offset) + cam.t[0], dot(W1, p.offset) + cam.t[1], dot(W2, p.offset) + cam.t[2]};
   p.iz = splat<F>(1.f) / p.t.z;
-  p.ux = p.t.x * p.iz;
-  p.uy = p.t.y * p.iz;
-  p.mx = p.ux * cam.fx + cam.cx;
-  p.my = p.uy * cam.fy + cam.cy;
-  p.vx = clamp(p.ux, splat<F>(cam.x_min), splat<F>(cam.x_max));
-  p.vy = clamp(p.uy, splat<F>(cam.y_min), splat<F>(cam.y_max));
-  p.T0 = (W0 - W2 * p.vx) * (p.iz * cam.fx);
-  p.T1 = (W1 - W2 * p.vy) * (p.iz * cam.fy);
+  p.ray_x = p.t.x * p.iz;
+  p.ray_y = p.t.y * p.iz;
+  p.mx = p.ray_x * cam.fx + cam.cx;
+  p.my = p.ray_y * cam.fy + cam.cy;
+  p.bound_x = clamp(p.ray_x, splat<F>(cam.x_min), splat<F>(cam.x_max));
+  p.bound_y = clamp(p.ray_y, splat<F>(cam.y_min), splat<F>(cam.y_max));
+  p.JW0 = (W0 - W2 * p.bound_x) * (p.iz * cam.fx);
+  p.JW1 = (W1 - W2 * p.bound_y) * (p.iz * cam.fy);
 
   // Divide by the largest component first: the squares of tiny and huge quaternions would leave the range of float.
   const F big = max(max(abs(g.qw), abs(g.qx)), max(abs(g.qy), abs(g.qz)));
@@ -99,8 +100,8 @@ template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<
   p.R = rotation(p.qw, p.qx, p.qy, p.qz);
   p.scale = {exp(g.log_scale.x), exp(g.log_scale.y), exp(g.log_scale.z)};
 
-  p.M0 = {dot(p.T0, p.R.c0) * p.scale.x, dot(p.T0, p.R.c1) * p.scale.y, dot(p.T0, p.R.c2) * p.scale.z};
-  p.M1 = {dot(p.T1, p.R.c0) * p.scale.x, dot(p.T1, p.R.c1) * p.scale.y, dot(p.T1, p.R.c2) * p.scale.z};
+  p.M0 = {dot(p.JW0, p.R.c0) * p.scale.x, dot(p.JW0, p.R.c1) * p.scale.y, dot(p.JW0, p.R.c2) * p.scale.z};
+  p.M1 = {dot(p.JW1, p.R.c0) * p.scale.x, dot(p.JW1, p.R.c1) * p.scale.y, dot(p.JW1, p.R.c2) * p.scale.z};
   const F d0 = dot(p.M0, p.M0), d1 = dot(p.M1, p.M1);
   p.xx = d0 + cam.eps2d;
   p.yy = d1 + cam.eps2d;
@@ -117,8 +118,8 @@ template <class F> inline Projected<F> project(const Camera& cam, const Splat3D<
   return p;
 }
 
-// The upper triangular factor L of the conic Q = Lᵀ L: (u, v) = L d has dᵀ Q d = u² + v². In these whitened coordinates
-// every splat is a round unit blob, so sums over its pixels neither cancel nor overflow, however thin it is.
+// The upper triangular factor L of the conic Q = Lᵀ L, (11): (u, v) = L d has dᵀ Q d = u² + v². In these whitened
+// coordinates every splat is a round unit blob: sums over its pixels neither cancel nor overflow, however thin it is.
 template <class F> struct Whitening {
   F A, B, C;  // u = A dx + B dy, v = C dy
 };
@@ -127,7 +128,7 @@ template <class F> inline Whitening<F> whitening(const Projected<F>& p) {
   return {A, splat<F>(0.f) - A * (p.xy / p.yy), splat<F>(1.f) / sqrt(p.yy)};
 }
 
-// dLoss/d(what the blending stage saw): moments of s = dLoss/d ln(alpha) over the splat's pixels.
+// Moments of s = dLoss/d ln(alpha) over the splat's pixels, (11).
 template <class F> struct SplatGradient {
   F u, v, uu, uv, vv;  // Σ s u, ...
   F log_opacity;       // Σ s: natural logarithm of the effective opacity
@@ -135,28 +136,29 @@ template <class F> struct SplatGradient {
   F depth;
 };
 
+// Equations (12) to (16).
 template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const Whitening<F>& L,
                                                       const SplatGradient<F>& v) {
-  // T and M of project(), whitened: dLoss/d(cov2d) is half of Lᵀ [uu uv; uv vv] L, so that L never has to be undone.
-  const Vec3<F> T0 = p.T0 * L.A + p.T1 * L.B, T1 = p.T1 * L.C;
+  // JW and M of project(), whitened: dLoss/d(cov2d) is half of Lᵀ [uu uv; uv vv] L, so that L never has to be undone.
+  const Vec3<F> JW0 = p.JW0 * L.A + p.JW1 * L.B, JW1 = p.JW1 * L.C;
   // A M0 + B M1 without its difference: M1·M1 M0 - M0·M1 M1 = M1 x (M0 x M1).
   const Vec3<F> M0 = (p.M0 * cam.eps2d + cross(p.M1, p.n)) * (L.A / p.yy), M1 = p.M1 * L.C;
   F uu = v.uu, uv = v.uv, vv = v.vv;
   Splat3D<F> out;
   out.logit = v.log_opacity * p.transparency;
-  if (cam.antialiased) {  // log opacity holds (log det0 - log det) / 2, and M Mᵀ whitened is M' M'ᵀ
+  if (cam.antialiased) {  // (12)
     const F h = v.log_opacity, ratio = p.det / max(p.det0, splat<F>(1e-30f));
     uu = uu + h * (dot(M1, M1) * ratio - 1.f);
     vv = vv + h * (dot(M0, M0) * ratio - 1.f);
     uv = uv - h * dot(M0, M1) * ratio;
   }
-  const Vec3<F> vM0 = M0 * uu + M1 * uv, vM1 = M0 * uv + M1 * vv;
-  out.log_scale = {vM0.x * M0.x + vM1.x * M1.x, vM0.y * M0.y + vM1.y * M1.y, vM0.z * M0.z + vM1.z * M1.z};
+  const Vec3<F> v_M0 = M0 * uu + M1 * uv, v_M1 = M0 * uv + M1 * vv;
+  out.log_scale = {v_M0.x * M0.x + v_M1.x * M1.x, v_M0.y * M0.y + v_M1.y * M1.y, v_M0.z * M0.z + v_M1.z * M1.z};
 
-  const Vec3<F> P0 = {vM0.x * p.scale.x, vM0.y * p.scale.y, vM0.z * p.scale.z};
-  const Vec3<F> P1 = {vM1.x * p.scale.x, vM1.y * p.scale.y, vM1.z * p.scale.z};
-  const Vec3<F> r0 = T0 * P0.x + T1 * P1.x, r1 = T0 * P0.y + T1 * P1.y, r2 = T0 * P0.z + T1 * P1.z;
-  // dLoss/dR has columns r0, r1, r2; chain to the unit quaternion, then through the normalization.
+  const Vec3<F> P0 = {v_M0.x * p.scale.x, v_M0.y * p.scale.y, v_M0.z * p.scale.z};
+  const Vec3<F> P1 = {v_M1.x * p.scale.x, v_M1.y * p.scale.y, v_M1.z * p.scale.z};
+  const Vec3<F> r0 = JW0 * P0.x + JW1 * P1.x, r1 = JW0 * P0.y + JW1 * P1.y, r2 = JW0 * P0.z + JW1 * P1.z;
+  // dLoss/dR has columns r0, r1, r2; (15) takes it to the quaternion.
   const F w = p.qw, x = p.qx, y = p.qy, z = p.qz;
   const F a12 = r1.z - r2.y, a20 = r2.x - r0.z, a01 = r0.y - r1.x;
   const F s01 = r1.x + r0.y, s02 = r2.x + r0.z, s12 = r2.y + r1.z;
@@ -170,17 +172,17 @@ template <class F> inline Splat3D<F> project_backward(const Camera& cam, const P
   out.qy = (gy - y * radial) * iq;
   out.qz = (gz - z * radial) * iq;
 
-  const Vec3<F> wT0 = p.R.c0 * P0.x + p.R.c1 * P0.y + p.R.c2 * P0.z;  // of the whitened T
-  const Vec3<F> wT1 = p.R.c0 * P1.x + p.R.c1 * P1.y + p.R.c2 * P1.z;
-  const Vec3<F> vT0 = wT0 * L.A, vT1 = wT0 * L.B + wT1 * L.C;
+  const Vec3<F> v_white0 = p.R.c0 * P0.x + p.R.c1 * P0.y + p.R.c2 * P0.z;  // of the whitened JW
+  const Vec3<F> v_white1 = p.R.c0 * P1.x + p.R.c1 * P1.y + p.R.c2 * P1.z;
+  const Vec3<F> v_JW0 = v_white0 * L.A, v_JW1 = v_white0 * L.B + v_white1 * L.C;
   const Vec3<F> W0 = splat3<F>(cam.R), W1 = splat3<F>(cam.R + 3), W2 = splat3<F>(cam.R + 6);
   const F h0 = p.iz * cam.fx, h1 = p.iz * cam.fy;
   const F zero = splat<F>(0.f);
-  const F vux = v.mx * cam.fx + select(p.ux == p.vx, zero - h0 * dot(vT0, W2), zero);
-  const F vuy = v.my * cam.fy + select(p.uy == p.vy, zero - h1 * dot(vT1, W2), zero);
-  const F vtx = vux * p.iz, vty = vuy * p.iz;
-  const F vtz = v.depth - (dot(wT0, T0) + dot(wT1, T1) + vux * p.ux + vuy * p.uy) * p.iz;
-  out.mean = W0 * vtx + W1 * vty + W2 * vtz;
+  const F v_ray_x = v.mx * cam.fx + select(p.ray_x == p.bound_x, zero - h0 * dot(v_JW0, W2), zero);
+  const F v_ray_y = v.my * cam.fy + select(p.ray_y == p.bound_y, zero - h1 * dot(v_JW1, W2), zero);
+  const F v_tx = v_ray_x * p.iz, v_ty = v_ray_y * p.iz;
+  const F v_tz = v.depth - (dot(v_white0, JW0) + dot(v_white1, JW1) + v_ray_x * p.ray_x + v_ray_y * p.ray_y) * p.iz;
+  out.mean = W0 * v_tx + W1 * v_ty + W2 * v_tz;
   return out;
 }
 

@@ -1,4 +1,4 @@
-// One Adam step in place (Kingma & Ba 2015): some thousand Gaussians at a time, all their numbers.
+// One Adam step in place (docs/math.md, 22): some thousand Gaussians at a time, all their numbers.
 #pragma once
 #include "frame.h"
 #include "parallel.h"
@@ -26,8 +26,8 @@ inline void adam_span(const AdamArguments& a, const AdamParameter& of, int64_t b
   }
 }
 
-// shN of n <= kWide Gaussians from `first` on, whose gradient no one wrote down. `rows` has room for it and zeros where
-// no band is drawn.
+// shN of n <= kWide Gaussians from `first` on, whose gradient is not stored. `rows` has room for it, zeros where no
+// band is drawn.
 inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t first, int n, float* rows) {
   const int bands = (a.sh_degree + 1) * (a.sh_degree + 1) - 1;
   alignas(64) float mean[3][kWide] = {}, Y[15][kWide];
@@ -39,8 +39,7 @@ inline void adam_bands(const AdamArguments& a, const AdamParameter& of, int64_t 
 }
 
 inline void adam_stage(Pool& pool, const AdamArguments& a) {
-  // A multiple of every vector's width: only the last numbers of all are stepped one by one, however many threads there
-  // are.
+  // A multiple of every vector's width: for any number of threads only the last numbers are stepped one by one.
   const int64_t fair = a.count / (4 * pool.threads()) / 256 * 256,
                 rows = fair < 256 ? 256 : (fair > 16384 ? 16384 : fair);
   parallel(pool, divide_up(a.count, rows), [&](int chunk, int) {

@@ -1,6 +1,6 @@
-// Stage 3: front-to-back compositing, block by block: what its pixels have become stays in registers while the splats
-// that touch it pass by, a batch at a time: first their alphas, which do not wait for each other, then what they do to
-// the pixels.
+// Stage 3: front-to-back compositing (docs/math.md, 7 and 8), block by block: what its pixels have become stays in
+// registers while the splats that touch it pass by, a batch at a time: first their alphas, which do not wait for each
+// other, then what they do to the pixels.
 #pragma once
 #include "blocks.h"
 
@@ -25,14 +25,15 @@ inline void alphas_of(const Local& local, const Touched& touched, const uint8_t*
   }
 }
 
-// Blends the splats of a list into a block, `first` being the number of the chunk's first splat. True when all its
-// pixels have become opaque.
+// Blends the splats of a list into a block by (8), `first` being the number of the chunk's first splat. True when all
+// its pixels have become opaque.
 template <bool Depth, bool Count>
 inline bool blend_block(const Local& local, const Touched& touched, const SplatList& list, int first, int block,
                         bool stop, BlockState& s, Work& work) {
   const px t_min = splat<px>(kTransmittanceMin);
   // T goes on behind the splat at which a pixel became opaque, so that no splat waits for that; T_end does not.
-  px T = load_px(s.T), T_end = T, r = load_px(s.r), g = load_px(s.g), b = load_px(s.b), depth = load_px(s.depth);
+  px T = load_px(s.T), T_end = T, depth = load_px(s.depth);
+  Vec3<px> color = {load_px(s.r), load_px(s.g), load_px(s.b)};
   pxi last = load_pxi(s.last);
   px alphas[kBatch];
   bool opaque = false;
@@ -46,9 +47,7 @@ inline bool blend_block(const Local& local, const Touched& touched, const SplatL
       T = T - alpha * T;
       T_end = select(alive, T, T_end);
       last = select(alive, splat_pxi(first + i), last);
-      r = r + weight * splat<px>(local.row[i].r);
-      g = g + weight * splat<px>(local.row[i].g);
-      b = b + weight * splat<px>(local.b[i]);
+      color = color + splat_color(local, i) * weight;
       if (Depth) depth = depth + weight * splat<px>(local.depth[i]);
       if (Count) {
         ++work.entries;
@@ -59,9 +58,9 @@ inline bool blend_block(const Local& local, const Touched& touched, const SplatL
     opaque = stop && !any(T > t_min);
   }
   store_px(s.T, T_end);
-  store_px(s.r, r);
-  store_px(s.g, g);
-  store_px(s.b, b);
+  store_px(s.r, color.x);
+  store_px(s.g, color.y);
+  store_px(s.b, color.z);
   store_px(s.depth, depth);
   store_pxi(s.last, last);
   return opaque;

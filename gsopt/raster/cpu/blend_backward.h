@@ -1,13 +1,12 @@
-// Stage 4: the gradient of compositing, back to front (docs/math.md, section "Compositing gradient").
+// Stage 4: the gradient of compositing, back to front (docs/math.md, 9 to 11).
 //
-// With q = c·g the splat's color projected on the pixel's gradient g, and A the same for everything behind it,
-// already composited, s = alpha dLoss/dalpha = w (q - A). Behind the last splat A = background·g - dLoss/dalpha_out.
-// T is recovered by dividing by 1 - alpha; it never falls below what the forward pass stopped at.
+// q is the splat's color (and depth) projected on the pixel's gradient, `behind` the same for what was composited
+// behind it: s = dLoss/d ln(alpha) = weight (q - behind). T is recovered by dividing by 1 - alpha; it never falls below
+// what the forward pass stopped at.
 //
-// Splat by splat, and for each twice over the blocks that it touches: its alphas, then s and all sums. These stay in
-// registers while the blocks pass by, and a processor that looks some hundred instructions ahead finds several blocks
-// to work on. Each (splat, tile) pair owns one row of sums, so no two threads ever add to the same number and the
-// result does not depend on their order.
+// Each splat passes twice over the blocks that it touches: first its alphas, then s and all sums, which stay in
+// registers while a processor that looks some hundred instructions ahead finds several blocks to work on. Each (splat,
+// tile) pair owns one row of sums: no two threads add to the same number, and their order does not matter.
 #pragma once
 #include "tile.h"
 
@@ -47,38 +46,37 @@ inline void alphas_of(const Local::Row& s, uint32_t mask, Alphas& out) {
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     const int block = __builtin_ctz(rest);
-    out.alpha[n] = alpha_of(exponent(spread, load_px(kBlockPixels.x[block]), load_px(kBlockPixels.y[block]), out.at[n]));
+    out.alpha[n] =
+        alpha_of(exponent(spread, load_px(kBlockPixels.x[block]), load_px(kBlockPixels.y[block]), out.at[n]));
   }
 }
 
-// The row of splat `i` of a chunk, entry `index` (one-based) of its tile, over the blocks of `mask`.
+// The row of splat `i` of a chunk, entry `index` (one-based) of its tile: the sums of (10) and (11) over blocks.
 template <bool Depth, bool Abs>
 inline void blend_splat_backward(const Local& local, int i, int index, uint32_t mask, BlockGradient* grads,
                                  float* row) {
   const Local::Row& splat_i = local.row[i];
   const px B = splat<px>(splat_i.B), C = splat<px>(splat_i.C);
-  const px r = splat<px>(splat_i.r), g = splat<px>(splat_i.g), b = splat<px>(local.b[i]),
-           depth = splat<px>(local.depth[i]);
+  const Vec3<px> color = splat_color(local, i);
+  const px depth = splat<px>(local.depth[i]);
   const px one = splat<px>(1.f), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
   alphas_of(splat_i, mask, alphas);
-  px wr = zero, wg = zero, wb = zero, wz = zero, s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero,
-     abs_x = zero, abs_y = zero;
+  Vec3<px> v_color = {zero, zero, zero};
+  px v_depth = zero, s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero, abs_x = zero, abs_y = zero;
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     BlockGradient& p = grads[__builtin_ctz(rest)];
     const px alpha = keep(load_pxi(p.last) > here, alphas.alpha[n]), past = one - alpha;
     const px T = load_px(p.T) * (one / past), weight = alpha * T, behind = load_px(p.behind);
-    const px gr = load_px(p.r), gg = load_px(p.g), gb = load_px(p.b);
-    px q = r * gr + g * gg + b * gb;
+    const Vec3<px> g = {load_px(p.r), load_px(p.g), load_px(p.b)};
+    px q = dot(color, g);
     if (Depth) q = q + depth * load_px(p.depth);
     store_px(p.T, T);
     store_px(p.behind, behind * past + alpha * q);
-    wr = wr + weight * gr;
-    wg = wg + weight * gg;
-    wb = wb + weight * gb;
-    if (Depth) wz = wz + weight * load_px(p.depth);
+    v_color = v_color + g * weight;
+    if (Depth) v_depth = v_depth + weight * load_px(p.depth);
     const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
     const px u = alphas.at[n].u, v = alphas.at[n].v, s_u = s * u, s_v = s * v;
     s0 = s0 + s;
@@ -93,7 +91,8 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
     }
   }
   const px scale = splat<px>(1.f / kHalfLog2E);
-  store_sums(row, {s0, su, sv, suu, suv, svv, wr, wg, wb, wz, abs_x * splat<px>(splat_i.A) * scale, abs_y * scale});
+  store_sums(row, {s0, su, sv, suu, suv, svv, v_color.x, v_color.y, v_color.z, v_depth,
+                   abs_x * splat<px>(splat_i.A) * scale, abs_y * scale});
 }
 
 template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& frame, int tile, const BackwardInput& in) {

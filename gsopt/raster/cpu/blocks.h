@@ -5,8 +5,8 @@
 
 namespace gsopt::GSOPT_ISA {
 
-// Per lane the bits of the blocks with a pixel that the ellipse alpha >= 1/255 reaches (docs/math.md, 8c): bit 4 strip +
-// column. A strip is as wide as its rows together.
+// Per lane the bits of the blocks with a pixel that the ellipse alpha >= 1/255 reaches (docs/math.md, 8c): bit 4 strip
+// + column. A strip is as wide as its rows together.
 inline widei block_masks(wide A, wide B, wide C, wide lo, wide dx, wide dy) {
   const Reach<wide> reach(A, B, C, lo);
   const wide zero = splat<wide>(0.f), huge = splat<wide>(1e30f), width = reach.width * kSqrtNear;

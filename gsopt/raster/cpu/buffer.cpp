@@ -10,7 +10,7 @@ namespace gsopt {
 
 Buffer::~Buffer() { std::free(data_); }
 
-// Large buffers lie on large pages where the system has them: splats are looked up all over, and each page costs a look
+// Large buffers lie on large pages where the system has them: splats lie all over, and looking up a page costs time
 // too.
 void Buffer::reserve(size_t bytes) {
   if (bytes <= capacity_) return;

@@ -30,7 +30,7 @@ class Buffer {
   size_t capacity_ = 0;
 };
 
-// A splat on the image plane: exponent in base 2 is log2_opacity - (A dx + B dy)² - (C dy)².
+// A splat on the image plane: (8a) has its exponent in base 2, log2_opacity - (A dx + B dy)² - (C dy)².
 struct alignas(64) Record {
   float mx, my, A, B, C, log2_opacity, r, g;
   float b, depth;

@@ -1,9 +1,8 @@
-// How well the window around each pixel of a picture matches another picture, if what it shows lies on a given plane:
-// one minus the weighted normalised cross-correlation (gsopt/init/stereo/matching.py). Eight neighboring pixels at a
-// time.
+// Window costs of stereo matching (docs/math.md, 25 and 26; gsopt/init/stereo/matching.py), eight neighboring pixels at
+// a time: one minus the weighted normalized cross-correlation of an image with another across a plane per pixel.
 //
-// A plane is an inverse depth that is affine in the ray (x, y, 1) of a pixel: w = a x + b y + c. The ray's point, times
-// w, projects to A (x, y, 1) + T w, so every tap of the window is the center's projection plus two steps.
+// With w the inverse depth of (25), A = K R' and T = K τ', the point on a ray projects to A (x, y, 1) + T w: every tap
+// of the window is the center's projection plus two steps.
 #pragma once
 #include "frame.h"
 #include "parallel.h"

@@ -1,6 +1,7 @@
 // The Python side of the CPU kernels: arrays in and out by DLPack, no torch, the GIL released while kernels run.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
@@ -118,7 +119,7 @@ Parameters parameters_of(const Model& m, int sh_degree) {
           data_of(m.shN, 3 * n * rest, "shN")};
 }
 
-// viewmat [4,4], K [3,3] row-major double: the centre is found in double so that far-away scenes keep their precision.
+// viewmat [4,4], K [3,3] row-major double: the center is found in double so that far-away scenes keep their precision.
 Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, int width, int height, double near_plane,
                    double far_plane, double eps2d, bool antialiased) {
   if (V.size() != 16 || K.size() != 9 || width < 1 || height < 1)
@@ -168,21 +169,25 @@ void reserve_frame(Frame& f, int64_t n) {
     b->reserve(sizeof(float) * kTile * kTile * static_cast<size_t>(f.tiles()));
 }
 
-void forward(Workspace& ws, Frame& frame, const Model& model, int sh_degree, const Camera& camera,
-             std::tuple<float, float, float> background, Out colors, Out alphas, std::optional<Out> depths,
-             OutInt radii) {
+// What `forward` writes, as in raster.RenderedFrame.
+struct Image {
+  Out colors, alphas;
+  std::optional<Out> depths;
+  OutInt radii;
+};
+
+void forward(Workspace& ws, Frame& frame, const Model& model, const Camera& camera, const Image& image, int sh_degree,
+             const std::array<float, 3>& background) {
   std::vector<Work> work(ws.count_work ? ws.pool.threads() : 0);
   const Parameters P = parameters_of(model, sh_degree);
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
-  const ForwardOutput out = {data_of(colors, 3 * pixels, "colors"), data_of(alphas, pixels, "alphas"),
-                             depths ? data_of(*depths, pixels, "depths") : nullptr,
-                             data_of(radii, 2 * static_cast<size_t>(P.count), "radii"),
+  const ForwardOutput out = {data_of(image.colors, 3 * pixels, "colors"), data_of(image.alphas, pixels, "alphas"),
+                             image.depths ? data_of(*image.depths, pixels, "depths") : nullptr,
+                             data_of(image.radii, 2 * static_cast<size_t>(P.count), "radii"),
                              ws.count_work ? work.data() : nullptr};
   nb::gil_scoped_release release;
   frame.camera = camera;
-  frame.background[0] = std::get<0>(background);
-  frame.background[1] = std::get<1>(background);
-  frame.background[2] = std::get<2>(background);
+  std::copy(background.begin(), background.end(), frame.background);
   frame.sh_degree = sh_degree;
   frame.count = P.count;
   frame.skips = ws.skips;
@@ -250,17 +255,21 @@ std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Ou
   return {a.l1, a.ssim};
 }
 
-// Rates and numbers of steps, from 1, of the six tensors of a model; 0 steps: that tensor is left alone.
-void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_avg_sq, const std::vector<double>& lr,
-          const std::vector<int64_t>& steps, double beta1, double beta2, double eps, const Camera& camera,
-          int sh_degree) {
-  if (lr.size() != 6 || steps.size() != 6) throw std::invalid_argument("adam: wrong number of rates or steps");
+// Rates and numbers of steps, from 1, of the six tensors of a model, as in raster.AdamStep; 0 steps: left alone.
+struct AdamStep {
+  std::array<double, 6> lr;
+  std::array<int64_t, 6> steps;
+  double beta1, beta2, eps;
+};
+
+void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_avg_sq, const AdamStep& step,
+          const Camera& camera, int sh_degree) {
   const Parameters P = parameters_of(model, sh_degree);
   if (P.count == 0) return;
   AdamArguments a = {P.count,
-                     static_cast<float>(beta1),
-                     static_cast<float>(beta2),
-                     static_cast<float>(eps),
+                     static_cast<float>(step.beta1),
+                     static_cast<float>(step.beta2),
+                     static_cast<float>(step.eps),
                      {},
                      {},
                      P.means,
@@ -272,17 +281,17 @@ void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_a
   for (int k = 0; k < 6; ++k) {
     Out &param = *model.all()[k], &m = *exp_avg.all()[k], &v = *exp_avg_sq.all()[k];
     const size_t size = param.size();
-    if (steps[k] == 0 || size == 0) continue;
-    const double c1 = 1.0 - std::pow(beta1, static_cast<double>(steps[k])),
-                 c2 = 1.0 - std::pow(beta2, static_cast<double>(steps[k]));
+    if (step.steps[k] == 0 || size == 0) continue;
+    const double t = static_cast<double>(step.steps[k]);
+    const double correction1 = 1.0 - std::pow(step.beta1, t), correction2 = 1.0 - std::pow(step.beta2, t);
     AdamParameter& out = gradients[k] ? a.others[k] : a.bands;
     out = {param.data(),
            data_of(m, size, "exp_avg"),
            data_of(v, size, "exp_avg_sq"),
            gradients[k] ? data_of(*gradients[k], size, "grad") : nullptr,
            static_cast<int64_t>(size) / P.count,
-           static_cast<float>(lr[k] / c1),
-           static_cast<float>(1.0 / std::sqrt(c2))};
+           static_cast<float>(step.lr[k] / correction1),
+           static_cast<float>(1.0 / std::sqrt(correction2))};
   }
   nb::gil_scoped_release release;
   timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
@@ -362,29 +371,25 @@ NB_MODULE(_cpu, m) {
         new (self) Camera(make_camera(V, K, width, height, near_plane, far_plane, eps2d, antialiased));
       });
   // noconvert: what is to be written must not be a copy.
-  nb::class_<Model>(m, "Model")
-      .def(nb::init<Out, Out, Out, Out, Out, Out>(), nb::arg().noconvert(), nb::arg().noconvert(),
-           nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert());
+  const auto out = nb::arg().noconvert();
+  const auto out_or_none = nb::arg().noconvert().none();
+  const auto in_or_none = nb::arg().none();
+  nb::class_<Model>(m, "Model").def(nb::init<Out, Out, Out, Out, Out, Out>(), out, out, out, out, out, out);
+  using MaybeOut = std::optional<Out>;
   nb::class_<Gradient>(m, "Gradient")
-      .def(
-          "__init__",
-          [](Gradient* self, Out means, Out quats, Out log_scales, Out logit_opacities, Out sh0, std::optional<Out> shN,
-             Out means2d, std::optional<Out> means2d_abs) {
-            new (self) Gradient{means, quats, log_scales, logit_opacities, sh0, shN, means2d, means2d_abs};
-          },
-          nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(), nb::arg().noconvert(),
-          nb::arg().noconvert(), nb::arg().noconvert().none(), nb::arg().noconvert(), nb::arg().noconvert().none());
-  m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-        nb::arg().none(), nb::arg());
-  m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(),
-        nb::arg());
+      .def(nb::init<Out, Out, Out, Out, Out, MaybeOut, Out, MaybeOut>(), out, out, out, out, out, out_or_none, out,
+           out_or_none);
+  nb::class_<Image>(m, "Image").def(nb::init<Out, Out, MaybeOut, OutInt>(), out, out, out_or_none, out);
+  nb::class_<AdamStep>(m, "AdamStep")
+      .def(nb::init<std::array<double, 6>, std::array<int64_t, 6>, double, double, double>(), nb::kw_only(),
+           nb::arg("lr"), nb::arg("steps"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"));
+  m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::kw_only(), nb::arg("sh_degree"),
+        nb::arg("background"));
+  m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), in_or_none, in_or_none, nb::arg());
   m.def("photometric", &photometric);
-  m.def("adam", &adam);
-  nb::class_<Windows>(m, "Windows")
-      .def("__init__", [](Windows* self, In offsets, In rays, In windows, In inverse_deviation, float step_x,
-                          float step_y, float least_variance, float unseen) {
-        new (self) Windows{offsets, rays, windows, inverse_deviation, step_x, step_y, least_variance, unseen};
-      });
+  m.def("adam", &adam, nb::arg(), nb::arg(), nb::arg(), nb::kw_only(), nb::arg("exp_avg"), nb::arg("exp_avg_sq"),
+        nb::arg("step"), nb::arg("camera"), nb::arg("sh_degree"));
+  nb::class_<Windows>(m, "Windows").def(nb::init<In, In, In, In, float, float, float, float>());
   m.def("match", &match);
 }
 

@@ -1,4 +1,4 @@
-// (1 - lambda) L1 + lambda (1 - SSIM) and its gradient, fused (docs/math.md, section "SSIM").
+// (1 - lambda) L1 + lambda (1 - SSIM) and its gradient, fused (docs/math.md, 19 to 21).
 //
 // SSIM needs five filtered images; only the sum of the two variances enters, so four do: x, y, x² + y², x y. The
 // 11-tap window is separable: first down the columns, two rows of output at a time, so that each input is loaded once
@@ -15,7 +15,7 @@ namespace gsopt::GSOPT_ISA {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kStrip = 2400, kHalo = 3 * kRadius;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-// exp(-k² / (2 1.5²)), normalised over k = -5..5; index = |k|.
+// exp(-k² / (2 1.5²)), normalized over k = -5..5; index = |k|.
 constexpr float kWindow[kRadius + 1] = {0.26601172f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
 
 // Weights of the twelve input rows y - 5 ... y + 6 in the output rows y and y + 1.
@@ -108,8 +108,7 @@ template <int Maps> class Columns {
   static constexpr int kPad = kHalo + 1, kStride = divide_up(kStrip + 2 * kHalo + 2 * kPad + kWide, 16) * 16;
   static constexpr float kNothing[kStride] = {};
 
-  // A row of an image from `first` on: zeros above and below it, a copy that fills a vector where it is too narrow for
-  // one.
+  // A row of an image from `first` on: zeros above and below it, a copy that fills a vector where it is narrower.
   const float* row_of(const Image& image, int y, float copy[kWide]) const {
     if (y < 0 || y >= b.height) return kNothing;
     const float* row = image.at(y, first);
@@ -135,7 +134,7 @@ inline void store_first(float* p, wide v, int n) {
   for (int l = 0; l < n; ++l) p[l] = v[l];
 }
 
-// The partial derivatives of SSIM at one pixel-channel with respect to E[x], E[x² + y²], E[x y], and SSIM itself.
+// (19) and (20) at one pixel-channel: SSIM and its partial derivatives with respect to E[x], E[x² + y²], E[x y].
 inline wide ssim_partials(wide mx, wide my, wide square, wide product, wide& d_mean, wide& d_square, wide& d_product) {
   const wide mxx = mx * mx + my * my, mxy = mx * my;
   const wide a1 = mxy * 2.f + kC1, a2 = (product - mxy) * 2.f + kC2, b1 = mxx + kC1, b2 = (square - mxx) + kC2;
@@ -188,7 +187,7 @@ inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&i
 }
 
 // Two rows of the gradient from y on. The window is symmetric, so its transpose is itself:
-// v = F(d_mean) + 2 x F(d_square) + y F(d_product).
+// v = F(d_mean) + 2 x F(d_square) + y F(d_product), (21).
 inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y,
                           const Image (&maps)[3], double* row_l1) {
   const double count = static_cast<double>(b.width) * b.height;

@@ -1,4 +1,4 @@
-// Stage 1: Gaussians to splats, a vector at a time.
+// Stage 1: Gaussians to splats (docs/math.md, 1 to 6, 17), a vector at a time.
 #pragma once
 #include "../common/sh.h"
 #include "columns.h"
@@ -123,7 +123,7 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   const Whitening<wide> L = whitening(p);
   const wide A = L.A * kSqrtHalfLog2E, B = L.B * kSqrtHalfLog2E, C = L.C * kSqrtHalfLog2E;
   const wide lo = log2(max(p.opacity, splat<wide>(1e-37f)));
-  const wide reach = max(lo - kLog2AlphaMin, splat<wide>(0.f)) / k;  // dᵀ conic d where alpha = 1/255
+  const wide reach = max(lo - kLog2AlphaMin, splat<wide>(0.f)) / k;  // (6)
   const wide rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
   const widei ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
                    (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) &
@@ -166,8 +166,7 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   }
 }
 
-// Fills records, covers and radii, and leaves ids and depth keys of the visible Gaussians, in index order, for the
-// sort.
+// Fills records, covers and radii, and lists ids and depth keys of the visible Gaussians in index order.
 inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t* radii) {
   const int chunks = divide_up(P.count, kProjectChunk);
   uint32_t *ids = frame.order2.as<uint32_t>(), *keys = frame.keys2.as<uint32_t>();
@@ -203,8 +202,8 @@ inline void project_stage(Pool& pool, Frame& frame, const Parameters& P, int32_t
   covers[P.count].slot = static_cast<uint32_t>(frame.intersections);
 }
 
-// Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 at `row`, but for bands that are not drawn. Writes one float more,
-// which is the next row's or spare.
+// Row n of dLoss/d(shN) = Y ⊗ dLoss/d(sh0) / Y_0 (18) at `row`, but for bands that are not drawn. Writes one float
+// more, which is the next row's or spare.
 inline void bands_gradient(const float* v_sh0, int64_t n, int bands, const float (*Y)[kWide], int lane, float* row) {
   const float* v = v_sh0 + 3 * n;
   const f4 v_color = f4{v[0], v[1], v[2], 0.f} * (1.f / kSH0);

@@ -1,4 +1,4 @@
-// Stage 5: the gradients of splats to gradients of Gaussians, a vector at a time.
+// Stage 5: the gradients of splats to gradients of Gaussians (docs/math.md, 12 to 18), a vector at a time.
 #pragma once
 #include "project.h"
 
@@ -10,28 +10,28 @@ inline void store_vec3(float* rows, const int64_t index[kWide], const Vec3<wide>
   store_fours({v.x, v.y, v.z, v.z}, [&](int l, f4 row) { std::memcpy(rows + 3 * index[l], &row, sizeof(float) * 3); });
 }
 
-// dLoss/d(color), none where a color was clamped at black.
+// v_c of (10), none where a color was clamped at black.
 inline Vec3<wide> color_gradient(const Frame& frame, const int64_t index[kWide], const wide field[kRow]) {
   wide drawn[4];
   load_fours([&](int l) { return load4(&frame.records.as<Record>()[index[l]].r); }, drawn);
   return {keep(drawn[0] > 0.f, field[kWr]), keep(drawn[1] > 0.f, field[kWg]), keep(drawn[2] > 0.f, field[kWb])};
 }
 
-// dLoss/d(direction), before normalisation.
+// v_e of (18).
 inline Vec3<wide> sh_backward(const Parameters& P, const int64_t index[kWide], int degree, const Vec3<wide>& d,
                               const Vec3<wide>& v_color) {
   const int bands = (degree + 1) * (degree + 1) - 1;
-  wide sh[3 * kMaxBands + 3], Yx[kMaxBands], Yy[kMaxBands], Yz[kMaxBands];
+  wide sh[3 * kMaxBands + 3];
+  Vec3<wide> Y[kMaxBands];
   load_bands(P, index, bands, sh);
-  sh_basis_gradient(degree, d.x, d.y, d.z, Yx, Yy, Yz);
+  sh_basis_gradient(degree, d.x, d.y, d.z, Y);
   const wide zero = splat<wide>(0.f);
   Vec3<wide> out = {zero, zero, zero};
-  for (int k = 0; k < bands; ++k)
-    out = out + Vec3<wide>{Yx[k], Yy[k], Yz[k]} * dot(v_color, {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]});
+  for (int k = 0; k < bands; ++k) out = out + Y[k] * dot(v_color, {sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]});
   return out;
 }
 
-// dLoss/d(shN) of a vector of Gaussians whose dLoss/d(sh0) is written.
+// v_sh,k of (18) of a vector of Gaussians whose dLoss/d(sh0) is written.
 inline void write_bands_gradient(const Frame& frame, const Parameters& P, const ParameterGradients& G,
                                  const int64_t index[kWide], const Vec3<wide>& mean) {
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
@@ -60,8 +60,7 @@ inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
   return any(nonzero);
 }
 
-// A full vector, always: a compiler that knew how many lanes count would round otherwise for whole vectors than for the
-// last one.
+// A full vector, always: a compiler that knew how many lanes count might round the last vector otherwise.
 inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G,
                                    const int64_t index[kWide], const float sums[kWide][kRow]) {
   const Camera& cam = frame.camera;

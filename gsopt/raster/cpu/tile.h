@@ -36,8 +36,8 @@ inline void prefetch_records(const Frame& frame, int64_t begin, int64_t end) {
   for (int64_t k = begin > 0 ? begin : 0; k < end; ++k) __builtin_prefetch(&records[entries[k].id], 0, 2);
 }
 
-// Calls body(k, worker) for k = 0 ... tiles - 1. A worker gets several in a row, because a tile asks for the records of
-// the next.
+// Calls body(k, worker) for k = 0 ... tiles - 1. A worker gets several in a row: a tile prefetches the records of the
+// next.
 template <class Body> inline void for_each_tile_of(Pool& pool, const Frame& frame, Body&& body) {
   const int fair = frame.tiles() / (16 * pool.threads()), run = fair < 1 ? 1 : (fair < 16 ? fair : 16);
   parallel(pool, divide_up(frame.tiles(), run), [&](int item, int worker) {
@@ -90,11 +90,16 @@ inline px exponent(const Spread& s, px X, px Y, Whitened<px>& at) {
   return s.log2_opacity - at.v * at.v - at.u * at.u;  // v is ready first
 }
 
-// alpha of (7).
-inline px alpha_of(px exponent) { return keep(exponent >= splat<px>(kLog2AlphaMin), min(exp2(exponent), splat<px>(kAlphaMax))); }
+inline Vec3<px> splat_color(const Local& local, int i) {
+  return {splat<px>(local.row[i].r), splat<px>(local.row[i].g), splat<px>(local.b[i])};
+}
 
-// Calls visit(pixel of the image, lane, n) for the rows of a block, each the n <= 4 of its pixels that lie inside the
-// image.
+// alpha of (7).
+inline px alpha_of(px exponent) {
+  return keep(exponent >= splat<px>(kLog2AlphaMin), min(exp2(exponent), splat<px>(kAlphaMax)));
+}
+
+// Calls visit(pixel of the image, lane, n) for the rows of a block, n <= 4 of whose pixels lie inside the image.
 template <class Visit> inline void for_each_row(const Frame& frame, int tile, int block, Visit&& visit) {
   const int x0 = tile % frame.tiles_x * kTile + 4 * (block % 4),
             y0 = tile / frame.tiles_x * kTile + kBlockRows * (block / 4);

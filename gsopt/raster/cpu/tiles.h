@@ -1,9 +1,7 @@
-// Which tiles a splat is listed in: those where its ellipse alpha >= 1/255 reaches a pixel centre (up to a small
-// margin).
+// The tiles that list a splat: those where its ellipse (docs/math.md, 8b, 8c) reaches a pixel center, or nearly (reach.h).
 //
-// (A x + B y)² + (C y)² = t bounds the ellipse. Over a strip of rows its right end lies at the strip's y nearest to
-// that of its rightmost point, y_r = -B/C sqrt(t / (B² + C²)); its left end mirrors that. Tile x holds the pixel
-// centres 16 x + 0.5 ... 16 x + 15.5.
+// Over a strip of rows its right end lies in the row nearest to that of its rightmost point; its left end mirrors that.
+// Tile x holds the pixel centers 16 x + 0.5 ... 16 x + 15.5.
 #pragma once
 #include "reach.h"
 
@@ -45,8 +43,7 @@ template <class F> struct StripEnds {
   }
 };
 
-// Which tiles of their boxes a vector of splats touches, rows 0 to 3 and 4 to 7; of a box that is larger the result is
-// arbitrary.
+// Which tiles of their boxes a vector of splats touches, rows 0 to 3 and 4 to 7; arbitrary for a larger box.
 struct TileMasks {
   widei low, high;
 };
@@ -64,8 +61,8 @@ inline TileMasks tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, c
     const widei behind = whole((ends.right + (kTile - 0.5f)) * (1.f / kTile));
     const widei first =
         splat_widei(kMaskSide) - whole(splat<wide>(kMaskSide) - (ends.left - (kTile - 0.5f)) * (1.f / kTile));
-    const widei touched =
-        (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside & (ends.square >= 0.f) & (rows > row);
+    const widei touched = (shift_left(one, behind) - one) & ~(shift_left(one, first) - one) & inside &
+                          (ends.square >= 0.f) & (rows > row);
     (row < 4 ? out.low : out.high) |= touched << (kMaskSide * (row % 4));
   }
   return out;
