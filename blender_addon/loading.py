@@ -11,8 +11,7 @@ from typing import Any
 import bpy
 
 from . import splat_object
-from .core import run as runs
-from .core import statistics
+from .core import run_follower, statistics
 from .core.errors import GsoptError, InputError
 from .core.ply import read_ply
 from .core.splats import Splats
@@ -30,7 +29,7 @@ def splat_file(path: Path) -> Path:
     """The file to read: itself, or what a run directory has. InputError where there is none."""
     if not path.is_dir():
         return path
-    found = runs.splats_of(path)
+    found = run_follower.splats_of(path)
     if found is None:
         raise InputError(f"{path} holds no splats yet. Wait for the first preview, or choose another run.")
     return found

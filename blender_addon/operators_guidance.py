@@ -8,21 +8,21 @@ from typing import Any
 
 import bpy
 
-from . import watching
+from . import job_results
 from .core import arguments, job, prompts
 from .core.errors import UsageError
+from .operator_errors import ReportingOperator, WaitingOperator
 from .operators_source import begin, refuse_two
 from .preferences import absolute, preferences, python, work_folder
-from .telling import Telling, Waiting
 
 
 def document(settings: Any) -> prompts.Document:
     """The panel's prompts, with what stood beside them in the file they came from."""
-    listed = tuple(watching.prompt_of(entry) for entry in settings.prompts if entry.text.strip())
+    listed = tuple(job_results.prompt_of(entry) for entry in settings.prompts if entry.text.strip())
     return prompts.Document(listed, json.loads(settings.prompts_rest or "{}"))
 
 
-class GSOPT_OT_prompt_add(Telling, bpy.types.Operator):
+class GSOPT_OT_prompt_add(ReportingOperator, bpy.types.Operator):
     """Add a prompt"""
 
     bl_idname = "gsopt.prompt_add"
@@ -43,7 +43,7 @@ class GSOPT_OT_prompt_add(Telling, bpy.types.Operator):
         settings.prompt_index = len(settings.prompts) - 1
 
 
-class GSOPT_OT_prompt_remove(Telling, bpy.types.Operator):
+class GSOPT_OT_prompt_remove(ReportingOperator, bpy.types.Operator):
     """Remove the prompt"""
 
     bl_idname = "gsopt.prompt_remove"
@@ -56,7 +56,7 @@ class GSOPT_OT_prompt_remove(Telling, bpy.types.Operator):
         settings.prompt_index = max(0, min(settings.prompt_index, len(settings.prompts) - 1))
 
 
-class GSOPT_OT_prompts_read(Telling, bpy.types.Operator):
+class GSOPT_OT_prompts_read(ReportingOperator, bpy.types.Operator):
     """Read a prompts.json in place of these prompts"""
 
     bl_idname = "gsopt.prompts_read"
@@ -74,7 +74,7 @@ class GSOPT_OT_prompts_read(Telling, bpy.types.Operator):
         settings, found = context.scene.gsopt, prompts.read_prompts(absolute(self.filepath))
         settings.prompts.clear()
         for prompt in found.prompts:
-            watching.fill_prompt(settings.prompts.add(), prompt)
+            job_results.fill_prompt(settings.prompts.add(), prompt)
         settings.prompts_rest = json.dumps(found.rest)
         listed = {entry.path for entry in settings.references}
         for path in map(str, found.accepted(absolute(self.filepath).parent)):
@@ -83,7 +83,7 @@ class GSOPT_OT_prompts_read(Telling, bpy.types.Operator):
         return f"{len(found.prompts)} prompts"
 
 
-class GSOPT_OT_prompts_write(Telling, bpy.types.Operator):
+class GSOPT_OT_prompts_write(ReportingOperator, bpy.types.Operator):
     """Write these prompts to a prompts.json, which `gsopt train --prompts` reads"""
 
     bl_idname = "gsopt.prompts_write"
@@ -104,7 +104,7 @@ class GSOPT_OT_prompts_write(Telling, bpy.types.Operator):
         return f"Wrote {path}"
 
 
-class GSOPT_OT_propose(Waiting, bpy.types.Operator):
+class GSOPT_OT_propose(WaitingOperator, bpy.types.Operator):
     """Have prompts written from your notes; you accept, edit or reject each of them"""
 
     bl_idname = "gsopt.propose"
@@ -125,7 +125,7 @@ class GSOPT_OT_propose(Waiting, bpy.types.Operator):
         return begin(context, self, job.start("prompts", call, folder, out))
 
 
-class GSOPT_OT_proposal(Telling, bpy.types.Operator):
+class GSOPT_OT_proposal(ReportingOperator, bpy.types.Operator):
     """Take the first proposal as it stands now, or drop it"""
 
     bl_idname = "gsopt.proposal"
@@ -141,11 +141,11 @@ class GSOPT_OT_proposal(Telling, bpy.types.Operator):
             raise UsageError("There is no proposal. Have prompts written first.")
         for _ in range(len(settings.proposals) if self.all else 1):
             if self.accept:
-                watching.fill_prompt(settings.prompts.add(), watching.prompt_of(settings.proposals[0]))
+                job_results.fill_prompt(settings.prompts.add(), job_results.prompt_of(settings.proposals[0]))
             settings.proposals.remove(0)
 
 
-class GSOPT_OT_reference_add(Telling, bpy.types.Operator):
+class GSOPT_OT_reference_add(ReportingOperator, bpy.types.Operator):
     """Add an image of the object or of its like"""
 
     bl_idname = "gsopt.reference_add"
@@ -166,7 +166,7 @@ class GSOPT_OT_reference_add(Telling, bpy.types.Operator):
         context.scene.gsopt.references.add().path = str(path)
 
 
-class GSOPT_OT_reference_remove(Telling, bpy.types.Operator):
+class GSOPT_OT_reference_remove(ReportingOperator, bpy.types.Operator):
     """Remove the reference image from the list"""
 
     bl_idname = "gsopt.reference_remove"

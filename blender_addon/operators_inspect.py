@@ -11,15 +11,15 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from . import loading, splat_object, watching
+from . import loading, progress_timer, splat_object
 from .core import dataset, statistics
 from .core.cameras import View, read_views
 from .core.errors import InputError, UsageError
 from .core.files import read_json
 from .core.ply import write_ply
 from .material import let_cycles_see_through
+from .operator_errors import ReportingOperator, WaitingOperator
 from .preferences import absolute
-from .telling import Telling, Waiting
 
 MOST_CAMERAS = 200
 UPRIGHT = Matrix.Rotation(-math.pi / 2, 4, "X")
@@ -28,7 +28,7 @@ UPRIGHT = Matrix.Rotation(-math.pi / 2, 4, "X")
 def active_splats(context: Any) -> Any:
     """The active object, or the only splats there are. UsageError where that is unclear."""
     active = context.view_layer.objects.active
-    found = [o for o in context.scene.objects if splat_object.is_splats(o) and not o.get(watching.LIVE)]
+    found = [o for o in context.scene.objects if splat_object.is_splats(o) and not o.get(progress_timer.LIVE)]
     if splat_object.is_splats(active):
         found = [active]
     if len(found) != 1:
@@ -57,7 +57,7 @@ def frame(settings: Any, data: Path | None) -> Matrix:
     return Matrix()
 
 
-class GSOPT_OT_import_splats(Waiting, bpy.types.Operator):
+class GSOPT_OT_import_splats(WaitingOperator, bpy.types.Operator):
     """Import splats: a run, a .ply or an .spz"""
 
     bl_idname = "gsopt.import_splats"
@@ -85,18 +85,18 @@ class GSOPT_OT_import_splats(Waiting, bpy.types.Operator):
         matrix = frame(settings, data_of(source if source.is_dir() else path.parent))
 
         def finish(target: Any, mesh: Any, summary: statistics.Summary) -> Iterator[None]:
-            thing = watching.add_object(target, mesh, summary, str(source), target.gsopt.display)
+            thing = progress_timer.add_object(target, mesh, summary, str(source), target.gsopt.display)
             thing.matrix_world = matrix
-            live = watching.live_object(target) if replaces_live else None
+            live = progress_timer.live_object(target) if replaces_live else None
             if live is not None:
                 splat_object.remove(bpy, live)
             let_cycles_see_through(target)
             yield  # Blender evaluates the nodes
             activate(thing)
             yield
-            watching.undo_step("Import Splats")
+            progress_timer.undo_step("Import Splats")
 
-        watching.load(scene, path, finish)
+        progress_timer.load(scene, path, finish)
         state = settings.job_import
         self.settle(lambda: state.state == "RUNNING", lambda: settings.message if state.state == "FAILED" else "")
         return f"{path.name} imported" if self.waits else f"Reading {path.name}"
@@ -112,7 +112,7 @@ def activate(thing: Any) -> None:
         layer.objects.active = thing
 
 
-class GSOPT_OT_import_cameras(Telling, bpy.types.Operator):
+class GSOPT_OT_import_cameras(ReportingOperator, bpy.types.Operator):
     """Import the dataset's cameras with their pictures as backgrounds"""
 
     bl_idname = "gsopt.import_cameras"
@@ -161,7 +161,7 @@ def add_camera(home: Any, view: View, matrix: Matrix, alpha: float) -> Any:
     return camera
 
 
-class GSOPT_OT_look_through(Telling, bpy.types.Operator):
+class GSOPT_OT_look_through(ReportingOperator, bpy.types.Operator):
     """Look through this input camera: its picture lies over the splats, the render has its size"""
 
     bl_idname = "gsopt.look_through"
@@ -206,7 +206,7 @@ def set_pixel_filter(scene: Any, value: float) -> None:
             splat_object.set_input(modifier, "Pixel Filter", value)
 
 
-class GSOPT_OT_statistics(Telling, bpy.types.Operator):
+class GSOPT_OT_statistics(ReportingOperator, bpy.types.Operator):
     """Count the splats and draw their histograms"""
 
     bl_idname = "gsopt.statistics"
@@ -219,7 +219,7 @@ class GSOPT_OT_statistics(Telling, bpy.types.Operator):
         return f"{found.count:,} splats, {found.outliers:,} outliers"
 
 
-class GSOPT_OT_filter(Telling, bpy.types.Operator):
+class GSOPT_OT_filter(ReportingOperator, bpy.types.Operator):
     """Hide the splats that do not pass; nothing is deleted"""
 
     bl_idname = "gsopt.filter"
@@ -255,7 +255,7 @@ def chosen_filter(settings: Any, thing: Any) -> statistics.Filter:
     )
 
 
-class GSOPT_OT_show_all(Telling, bpy.types.Operator):
+class GSOPT_OT_show_all(ReportingOperator, bpy.types.Operator):
     """Show the hidden splats again"""
 
     bl_idname = "gsopt.show_all"
@@ -268,7 +268,7 @@ class GSOPT_OT_show_all(Telling, bpy.types.Operator):
         loading.SUMMARIES.pop(mesh.name, None)
 
 
-class GSOPT_OT_delete_hidden(Telling, bpy.types.Operator):
+class GSOPT_OT_delete_hidden(ReportingOperator, bpy.types.Operator):
     """Delete the hidden splats from the object; the file stays as it is"""
 
     bl_idname = "gsopt.delete_hidden"
@@ -286,7 +286,7 @@ class GSOPT_OT_delete_hidden(Telling, bpy.types.Operator):
         return f"{int(gone.sum()):,} splats deleted, {len(kept):,} left"
 
 
-class GSOPT_OT_export(Telling, bpy.types.Operator):
+class GSOPT_OT_export(ReportingOperator, bpy.types.Operator):
     """Write the splats that are not hidden to a PLY, in the axes of the file they came from"""
 
     bl_idname = "gsopt.export"

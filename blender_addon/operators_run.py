@@ -7,31 +7,30 @@ from typing import Any
 
 import bpy
 
-from . import watching
-from .core import arguments, job
-from .core import run as runs
+from . import progress_timer
+from .core import arguments, job, run_follower
 from .core.errors import InputError, UsageError
+from .operator_errors import LONG, ReportingOperator, WaitingOperator
 from .operators_guidance import guidance
 from .operators_source import safe
 from .preferences import absolute, python, work_folder
-from .telling import LONG, Telling, Waiting
 
 
 def going_on(scene: Any) -> bool:
-    return scene.gsopt.run_status in watching.OPEN
+    return scene.gsopt.run_status in progress_timer.OPEN
 
 
-def follow(context: Any, operator: Waiting, said: str) -> str:
+def follow(context: Any, operator: WaitingOperator, said: str) -> str:
     """Without a window: to the end of the run."""
     settings = context.scene.gsopt
-    fine = (*watching.OPEN, "done", "stopped")
+    fine = (*progress_timer.OPEN, "done", "stopped")
     operator.settle(
         lambda: going_on(context.scene), lambda: "" if settings.run_status in fine else settings.run_message
     )
     return f"{settings.run_status} after {settings.run_step} steps" if operator.waits else said
 
 
-class GSOPT_OT_launch(Waiting, bpy.types.Operator):
+class GSOPT_OT_launch(WaitingOperator, bpy.types.Operator):
     """Learn splats from the dataset, in a process of its own that outlives Blender"""
 
     bl_idname = "gsopt.launch"
@@ -39,7 +38,7 @@ class GSOPT_OT_launch(Waiting, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         settings = context.scene.gsopt
-        watching.look(context.scene)
+        progress_timer.look(context.scene)
         if going_on(context.scene):
             raise UsageError("A run is going on. Stop it first, or open another scene.")
         chosen = settings.photos if settings.source == "PHOTOS" else settings.dataset
@@ -50,7 +49,7 @@ class GSOPT_OT_launch(Waiting, bpy.types.Operator):
         run = job.free_folder(work / "runs", safe(data))
         folder = job.free_folder(work / "jobs", "train")
         call = arguments.train(python(context), data, run, training(settings), guidance(settings, folder))
-        watching.attach(context.scene, run, job.start("train", call, folder, run))
+        progress_timer.attach(context.scene, run, job.start("train", call, folder, run))
         return follow(context, self, f"Started {run.name}")
 
 
@@ -69,7 +68,7 @@ def training(settings: Any) -> arguments.Training:
     )
 
 
-class GSOPT_OT_resume(Waiting, bpy.types.Operator):
+class GSOPT_OT_resume(WaitingOperator, bpy.types.Operator):
     """Go on with a run that was stopped or killed, from its newest checkpoint"""
 
     bl_idname = "gsopt.resume"
@@ -77,18 +76,18 @@ class GSOPT_OT_resume(Waiting, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         settings = context.scene.gsopt
-        watching.look(context.scene)
+        progress_timer.look(context.scene)
         if going_on(context.scene) or not settings.run_path:
             raise UsageError("There is no run that waits to go on. Attach to one first.")
         run = absolute(settings.run_path)
         folder = job.free_folder(work_folder(context) / "jobs", "train")
         call = arguments.resume(python(context), run, settings.threads)
-        told = runs.length(run)
-        watching.attach(context.scene, run, job.start("train", call, folder, run), told)
+        told = run_follower.length(run)
+        progress_timer.attach(context.scene, run, job.start("train", call, folder, run), told)
         return follow(context, self, f"{run.name} goes on")
 
 
-class GSOPT_OT_stop(Waiting, bpy.types.Operator):
+class GSOPT_OT_stop(WaitingOperator, bpy.types.Operator):
     """The run finishes its step, saves and exits; it can go on later"""
 
     bl_idname = "gsopt.stop"
@@ -97,19 +96,19 @@ class GSOPT_OT_stop(Waiting, bpy.types.Operator):
     kill: bpy.props.BoolProperty(name="End at Once", default=False, options={"SKIP_SAVE"})  # type: ignore[valid-type]
 
     def do(self, context: Any) -> str:
-        found = watching.follower(context.scene)
+        found = progress_timer.follower(context.scene)
         if found is None or not going_on(context.scene):
             raise UsageError("No run is going on. Launch one, or attach to one.")
         if self.kill and found.job is not None:
             job.end(found.job, force=True)
         else:
-            runs.ask_to_stop(found.run.path)
+            run_follower.ask_to_stop(found.run.path)
         if self.waits:
-            watching.wait(lambda: not going_on(context.scene), 600.0)
+            progress_timer.wait(lambda: not going_on(context.scene), 600.0)
         return "Asked to stop"
 
 
-class GSOPT_OT_attach(Telling, bpy.types.Operator):
+class GSOPT_OT_attach(ReportingOperator, bpy.types.Operator):
     """Follow a run that is there already"""
 
     bl_idname = "gsopt.attach"
@@ -127,12 +126,12 @@ class GSOPT_OT_attach(Telling, bpy.types.Operator):
         run = absolute(self.directory)
         if not any((run / name).is_file() for name in ("config.json", "events.jsonl")):
             raise InputError(f"{run} holds no run. Choose the folder that `gsopt train` wrote.")
-        watching.attach(context.scene, run)
-        watching.look(context.scene)
+        progress_timer.attach(context.scene, run)
+        progress_timer.look(context.scene)
         return f"{run.name}: {context.scene.gsopt.run_status}"
 
 
-class GSOPT_OT_follow(Telling, bpy.types.Operator):
+class GSOPT_OT_follow(ReportingOperator, bpy.types.Operator):
     """For scripts: wait until the run has reached a step or is over"""
 
     bl_idname = "gsopt.follow"
@@ -147,12 +146,12 @@ class GSOPT_OT_follow(Telling, bpy.types.Operator):
         def over() -> bool:
             return not going_on(context.scene) or settings.run_step >= self.step
 
-        if not watching.wait(over, self.seconds):
+        if not progress_timer.wait(over, self.seconds):
             raise UsageError(f"The run is at step {settings.run_step} after {self.seconds:g} s. Wait longer.")
         return f"{settings.run_status}, step {settings.run_step}"
 
 
-class GSOPT_OT_list_runs(Telling, bpy.types.Operator):
+class GSOPT_OT_list_runs(ReportingOperator, bpy.types.Operator):
     """Look for runs in the work folder"""
 
     bl_idname = "gsopt.list_runs"
@@ -161,13 +160,13 @@ class GSOPT_OT_list_runs(Telling, bpy.types.Operator):
     def do(self, context: Any) -> str:
         settings = context.scene.gsopt
         settings.runs.clear()
-        for path in runs.earlier_runs(work_folder(context) / "runs"):
+        for path in run_follower.earlier_runs(work_folder(context) / "runs"):
             entry = settings.runs.add()
             entry.name, entry.path = path.name, str(path)
         return f"{len(settings.runs)} runs"
 
 
-class GSOPT_OT_log(Telling, bpy.types.Operator):
+class GSOPT_OT_log(ReportingOperator, bpy.types.Operator):
     """Bring the end of the run's log into a text"""
 
     bl_idname = "gsopt.log"

@@ -8,16 +8,16 @@ from typing import Any
 
 import bpy
 
-from . import watching
+from . import progress_timer
 from .core import arguments, job
 from .core.errors import InputError, UsageError
+from .operator_errors import ReportingOperator, WaitingOperator
 from .preferences import absolute, python, script, work_folder
-from .telling import Telling, Waiting
 
 
-def begin(context: Any, operator: Waiting, work: job.Job) -> str:
+def begin(context: Any, operator: WaitingOperator, work: job.Job) -> str:
     """Follow a program that was started, without a window until its end."""
-    watching.started(context.scene, work)
+    progress_timer.started(context.scene, work)
     entry = getattr(context.scene.gsopt, f"job_{work.kind}")
     operator.settle(lambda: entry.state == "RUNNING", lambda: entry.message if entry.state == "FAILED" else "")
     return "Done." if operator.waits else "Started. The panel shows how far it is."
@@ -28,7 +28,7 @@ def refuse_two(context: Any, kind: str) -> None:
         raise UsageError("This work is going on already. Wait for it, or cancel it first.")
 
 
-class GSOPT_OT_test(Waiting, bpy.types.Operator):
+class GSOPT_OT_test(WaitingOperator, bpy.types.Operator):
     """Ask the interpreter what it has: `gsopt doctor`"""
 
     bl_idname = "gsopt.test"
@@ -42,7 +42,7 @@ class GSOPT_OT_test(Waiting, bpy.types.Operator):
         return str(context.scene.gsopt.doctor)
 
 
-class GSOPT_OT_render_dataset(Waiting, bpy.types.Operator):
+class GSOPT_OT_render_dataset(WaitingOperator, bpy.types.Operator):
     """Render posed views of the selected objects, or of the collection, in a Blender of its own"""
 
     bl_idname = "gsopt.render_dataset"
@@ -102,7 +102,7 @@ def write_shapes(folder: Path, shapes: list[Any]) -> Path:
     return path
 
 
-class GSOPT_OT_find_poses(Waiting, bpy.types.Operator):
+class GSOPT_OT_find_poses(WaitingOperator, bpy.types.Operator):
     """Find where the photos were taken from: `gsopt sfm`"""
 
     bl_idname = "gsopt.find_poses"
@@ -123,7 +123,7 @@ class GSOPT_OT_find_poses(Waiting, bpy.types.Operator):
         return begin(context, self, job.start("poses", call, folder, out))
 
 
-class GSOPT_OT_cancel(Telling, bpy.types.Operator):
+class GSOPT_OT_cancel(ReportingOperator, bpy.types.Operator):
     """End this work"""
 
     bl_idname = "gsopt.cancel"
@@ -132,8 +132,10 @@ class GSOPT_OT_cancel(Telling, bpy.types.Operator):
     kind: bpy.props.StringProperty()  # type: ignore[valid-type]
 
     def do(self, context: Any) -> str:
-        if self.kind not in watching.KINDS:
-            raise UsageError(f"There is no work called {self.kind!r:.40}. Name one of {', '.join(watching.KINDS)}.")
+        if self.kind not in progress_timer.KINDS:
+            raise UsageError(
+                f"There is no work called {self.kind!r:.40}. Name one of {', '.join(progress_timer.KINDS)}."
+            )
         entry = getattr(context.scene.gsopt, f"job_{self.kind}")
         job.end(job.read_job(Path(entry.folder)))
         entry.state, entry.message = "NONE", "Cancelled."

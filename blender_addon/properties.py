@@ -1,4 +1,4 @@
-"""What the panel holds; it is saved in the .blend. Values that a timer writes are told apart by `is_told`."""
+"""What the panel holds; it is saved in the .blend."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ from . import (
     operators_source,
     panel,
     preferences,
+    progress_timer,
     properties,
-    watching,
 )
 
 CLASSES = (
@@ -32,17 +32,17 @@ CLASSES = (
 @persistent
 def after_load(*_: Any) -> None:
     """A file was opened: whatever it left running is followed again."""
-    watching.pick_up()
+    progress_timer.pick_up()
 
 
 @persistent
 def before_undo(*_: Any) -> None:
-    watching.before_undo()
+    progress_timer.before_undo()
 
 
 @persistent
 def after_undo(*_: Any) -> None:
-    watching.after_undo()
+    progress_timer.after_undo()
 
 
 HANDLERS = {
@@ -78,7 +78,7 @@ def register() -> None:
 def unregister() -> None:
     if bpy.app.timers.is_registered(after_load):
         bpy.app.timers.unregister(after_load)
-    watching.forget()
+    progress_timer.forget()
     for moment, handler in HANDLERS.items():
         if handler in getattr(bpy.app.handlers, moment):
             getattr(bpy.app.handlers, moment).remove(handler)

@@ -6,7 +6,7 @@ Either with the `bpy` wheel (`pip install bpy`) or inside Blender 4.2 or newer:
     blender -b -P scripts/synth_views.py -- chair.glb -o data --views 24 --depth --format nerf,colmap
 
 Every object becomes a folder of `data` that `gsopt train` takes; docs/howto/synth_views.md tells what is in it.
-`synth.render.render_object` renders one object, `synth.library.run` a whole library; all of it imports without bpy.
+`synth.render_object.render_object` renders one object, `synth.render_dataset.run` a list; both import without bpy.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from typing import Any, get_args
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from synth import items
-from synth.crew import serve
-from synth.library import run
-from synth.render import require_blender
+from synth import mesh_items
+from synth.render_dataset import run
+from synth.render_object import require_blender
 from synth.settings import Engine, Layout, Lighting, Normalize, Settings
+from synth.worker_pool import serve
 
 from gsopt import check
 from gsopt.errors import GsoptError, UsageError
@@ -115,16 +115,16 @@ def pixels(text: str) -> tuple[int, int]:
     return int(width), int(height or width)
 
 
-def parse(arguments: Sequence[str]) -> tuple[list[items.Item], Settings, dict[str, Any]]:
-    """Items, settings and the other arguments of `library.run` from the command line."""
+def parse(arguments: Sequence[str]) -> tuple[list[mesh_items.Item], Settings, dict[str, Any]]:
+    """Items, settings and the other arguments of `render_dataset.run` from the command line."""
     words = with_hdri(arguments)
     given = vars(make_parser().parse_intermixed_args(words))
-    sources = [items.of_paths(given.pop("meshes"))]
+    sources = [mesh_items.of_paths(given.pop("meshes"))]
     shapenet, synsets, manifest = (given.pop(name) for name in ("shapenet", "synsets", "manifest"))
     if synsets and not shapenet:
         raise UsageError(f"`--synsets` chooses from `--shapenet ROOT`, got {','.join(synsets)} without. Give both.")
-    sources += [items.of_shapenet(shapenet, synsets)] if shapenet else []
-    sources += [items.of_manifest(manifest)] if manifest else []
+    sources += [mesh_items.of_shapenet(shapenet, synsets)] if shapenet else []
+    sources += [mesh_items.of_manifest(manifest)] if manifest else []
     limit = given.pop("limit")
     check.at_least("--limit", 1 if limit is None else limit, 1, "Drop the flag to render all.")
     how = {name: given.pop(name) for name in ("seed", "out", "workers", "resume", "time_limit")}
@@ -136,7 +136,7 @@ def parse(arguments: Sequence[str]) -> tuple[list[items.Item], Settings, dict[st
     if not settings.threads:
         settings = replace(settings, threads=max(1, available_cores() // how["workers"]))
     chosen = islice((item for source in sources for item in source), limit)
-    return items.unique(chosen), settings, how
+    return mesh_items.unique(chosen), settings, how
 
 
 def available_cores() -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from .errors import InputError, UsageError
 
-KNOWN = ("0.1",)
+KNOWN = ("0.1", "0.2")
 """Versions of gsopt whose flags and files this extension knows, as far as the second number."""
 SCRIPT = Path("scripts") / "synth_views.py"
 

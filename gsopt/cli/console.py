@@ -1,4 +1,4 @@
-"""What a person sees of a run: a live line on a terminal, else a plain line every tenth; log.txt gets those."""
+"""Lines for the user: progress of a run (live on a terminal, else plain, and in log.txt) and checks of output files."""
 
 from __future__ import annotations
 
@@ -11,12 +11,27 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from gsopt.errors import UsageError
+
 PLAIN_SHARE = 0.1
 """A plain line is written whenever this share of the steps has passed."""
 
 
+def report(line: str) -> None:
+    """Print one line at once, also when stdout is a pipe."""
+    print(line, flush=True)
+
+
+def require_writable(output: Path, overwrite: bool) -> None:
+    """UsageError before any work when the file could not be written, or would be lost."""
+    if output.exists() and not overwrite:
+        raise UsageError(f"{output} exists already. Add --overwrite to replace it, or name another file with -o.")
+    if not output.absolute().parent.is_dir():
+        raise UsageError(f"The folder of {output} does not exist. Make it first, or name another file with -o.")
+
+
 class RunConsole:
-    """Listens to a run's events and prints them; `say` prints any other line."""
+    """Prints a run's events; `say` prints any other line."""
 
     def __init__(self, run: Path) -> None:
         self._run = run
@@ -93,10 +108,10 @@ class RunConsole:
 
 
 def started_line(event: Mapping[str, Any], run: Path) -> str:
-    """Which backend, views and first Gaussians were chosen."""
+    """Returns the first line of a run: backend, views and first Gaussians."""
     views = f"{event['train_views']} input view{'s' * (event['train_views'] != 1)}"
     views += f", {event['test_views']} held out" if event["test_views"] else ", none held out"
-    few = " (few: regularisers on)" if event["sparse"] else ""
+    few = " (few: regularizers on)" if event["sparse"] else ""
     if mirrors := event["mirrors"]:
         few += f", symmetric: every view counts once more behind {mirrors} mirror{'s' * (mirrors != 1)}"
     begin = f"resumed at step {event['step']}" if event["step"] else f"init {event['init']}"
@@ -104,7 +119,7 @@ def started_line(event: Mapping[str, Any], run: Path) -> str:
 
 
 def progress_line(event: Mapping[str, Any]) -> str:
-    """Step, loss, PSNR of the input views, N, speed and what is left."""
+    """Returns step, loss, PSNR of the input views, N, speed and time left."""
     psnr = "" if event["psnr"] is None else f"  PSNR {event['psnr']:.2f} dB"
     eta = "" if event["eta_seconds"] is None else f"  ETA {clock(event['eta_seconds'])}"
     return (
@@ -125,7 +140,7 @@ def _tenths(event: Mapping[str, Any]) -> int:
 
 
 def _is_stdout(log: TextIO) -> bool:
-    """Whether whoever started us sends stdout to this very file."""
+    """True when stdout is redirected to this very file."""
     try:
         mine, theirs = os.fstat(log.fileno()), os.fstat(sys.stdout.fileno())
     except (OSError, ValueError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,34 +14,39 @@ from gsopt.errors import InputError, UsageError
 from gsopt.formats import SUFFIXES, is_antialiased, load_splats, save_splats, suffix_of
 
 SPLATS_OF_RUN = "splat.ply"
-_SAYS_ANTIALIASED = (".ply", ".spz")
+RECORDS_ANTIALIASED = (".ply", ".spz")
+"""Formats that record that splats need the 2D filter of Mip-Splatting."""
 
 
-def export(
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    force: bool = False,
-) -> int:
-    """Write splats in another format; nothing is left half-written.
+@dataclass(frozen=True)
+class Flags:
+    """Write splats in another format; nothing is left half-written."""
 
-    Args:
-        source: A splat file or a run directory (its splat.ply).
-        out: The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz or .glb.
-        force: Replace OUT if it exists.
-    """
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
+    """A splat file or a run directory (its splat.ply)."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz or .glb."""
+    force: bool = False
+    """Replace OUT if it exists."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Convert, print the size of the file and return 0."""
+    flags = tyro.cli(Flags, prog="gsopt export", args=list(argv))
+    out = flags.out
     suffix = suffix_of(out)
-    if out.exists() and not force:
+    if out.exists() and not flags.force:
         raise UsageError(f"`--out` must not exist yet, got {out}. Add --force to replace it, or choose another name.")
     if not out.parent.is_dir():
         raise InputError(f"`--out` must lie in a folder that exists, got {out.parent}. Create it first.")
-    source = splats_in(source)
+    source = splats_in(flags.source)
     antialiased = is_antialiased(source)
     gaussians = load_splats(source)
     save_splats(out, gaussians, antialiased=antialiased)
     if suffix == ".splat" and gaussians.sh_degree > 0:
         print("gsopt: note: .splat has no view-dependent color; bands 1 and up were dropped", file=sys.stderr)
-    if antialiased and suffix not in _SAYS_ANTIALIASED:
-        print(f"gsopt: note: {suffix} cannot say that these splats want antialiased rendering", file=sys.stderr)
+    if antialiased and suffix not in RECORDS_ANTIALIASED:
+        print(f"gsopt: note: {suffix} cannot record that these splats need antialiased rendering", file=sys.stderr)
     print(f"{out}: {len(gaussians):,} splats, {out.stat().st_size:,} bytes")
     return 0
 
@@ -56,8 +62,3 @@ def splats_in(source: Path) -> Path:
             "Wait until the run is done, or name one of its previews."
         )
     return splats
-
-
-def main(argv: Sequence[str]) -> int:
-    """Parse the arguments after `gsopt export` and run it; the exit code."""
-    return tyro.cli(export, args=list(argv), prog="gsopt export")

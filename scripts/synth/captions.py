@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from synth.cameras import Shot
-from synth.items import Item
+from synth.mesh_items import Item
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8

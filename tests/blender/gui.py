@@ -27,7 +27,7 @@ from made_splats import random_splats  # noqa: E402
 from scripted_server import completion, serving  # noqa: E402
 
 import blender_addon  # noqa: E402
-from blender_addon import watching  # noqa: E402
+from blender_addon import progress_timer  # noqa: E402
 from blender_addon.core.ply import write_ply  # noqa: E402
 
 PATIENCE = 900.0
@@ -93,8 +93,8 @@ def timed(found: dict[str, Any], operator: Any, **settings: Any) -> None:
 
 
 def longest_tick(found: dict[str, Any], what: str) -> None:
-    found.setdefault("longest tick, ms of CPU", {})[what] = round(1000 * max(watching.TIMES), 1)
-    watching.TIMES.clear()
+    found.setdefault("longest tick, ms of CPU", {})[what] = round(1000 * max(progress_timer.TIMES), 1)
+    progress_timer.TIMES.clear()
 
 
 def set_up(out: Path) -> None:
@@ -184,24 +184,24 @@ def run(out: Path, data: Path, found: dict[str, Any]) -> Story:
     settings = bpy.context.scene.gsopt
     settings.source, settings.dataset = "DATASET", str(data)
     settings.preset, settings.iterations = "own", STEPS
-    watching.undo_step("before the run")
-    watching.TIMES.clear()
+    progress_timer.undo_step("before the run")
+    progress_timer.TIMES.clear()
     timed(found, bpy.ops.gsopt.launch)
-    yield from until(lambda: watching.live_object(bpy.context.scene) or not settings.run_status)
-    live = watching.live_object(bpy.context.scene)
+    yield from until(lambda: progress_timer.live_object(bpy.context.scene) or not settings.run_status)
+    live = progress_timer.live_object(bpy.context.scene)
     frame(live)
     scroll(1)
     yield from shoot(out, "3_run")
-    yield from until(lambda: settings.run_step > ENOUGH or settings.run_status not in watching.OPEN)
+    yield from until(lambda: settings.run_step > ENOUGH or settings.run_status not in progress_timer.OPEN)
     yield from shoot(out, "3_run")
     found["seen running"] = [settings.run_status, settings.run_step, len(live.data.vertices)]
-    watching.undo_step("something")
+    progress_timer.undo_step("something")
     with bpy.context.temp_override(window=view()[0]):
         bpy.ops.ed.undo()
     settings = bpy.context.scene.gsopt
     found["after an undo"] = settings.run_status
     timed(found, bpy.ops.gsopt.stop)
-    yield from until(lambda: bpy.context.scene.gsopt.run_status not in watching.OPEN)
+    yield from until(lambda: bpy.context.scene.gsopt.run_status not in progress_timer.OPEN)
     settings = bpy.context.scene.gsopt
     found["run"] = [settings.run_status, settings.run_step, settings.run_count]
     longest_tick(found, "while it ran")
@@ -244,7 +244,7 @@ def a_million(out: Path, found: dict[str, Any]) -> Story:
     view()[2].shading.type = "SOLID"
     write_ply(out / "million.ply", random_splats(1_000_000))
     settings.display = "Points"
-    watching.TIMES.clear()
+    progress_timer.TIMES.clear()
     bpy.ops.gsopt.import_splats(filepath=str(out / "million.ply"))
     yield from until(lambda: settings.job_import.state != "RUNNING")
     found["a million"] = [settings.job_import.state, len(bpy.context.view_layer.objects.active.data.vertices)]
@@ -262,7 +262,7 @@ def story(out: Path, data: Path, found: dict[str, Any]) -> Story:
     yield from imported(out, data, found)
     yield from a_million(out, found)
     blender_addon.unregister()
-    found["timers left"] = bpy.app.timers.is_registered(watching.tick)
+    found["timers left"] = bpy.app.timers.is_registered(progress_timer.tick)
 
 
 def main(out: Path, data: Path) -> None:

@@ -128,7 +128,7 @@ def test_cameras_look_where_the_poses_say(panel: Any, tmp_path: Path) -> None:
 def test_live_previews_replace_each_other_in_short_ticks(panel: Any, tmp_path: Path) -> None:
     import bpy
 
-    from blender_addon import watching
+    from blender_addon import progress_timer
 
     run = tmp_path / "run"
     (run / "previews").mkdir(parents=True)
@@ -139,7 +139,7 @@ def test_live_previews_replace_each_other_in_short_ticks(panel: Any, tmp_path: P
             events := events + event("preview", step=step, path=f"previews/step_{step}.ply")
         )
         bpy.ops.gsopt.attach(directory=str(run))
-        assert watching.wait(lambda: panel.run_preview != "" and not watching._loads, 30)
+        assert progress_timer.wait(lambda: panel.run_preview != "" and not progress_timer._loads, 30)
     (live,) = (o for o in bpy.data.objects if o.get("gsopt_live"))
     assert len(live.data.vertices) == 2000
     assert len([mesh for mesh in bpy.data.meshes if mesh.get("gsopt_splats")]) == 1, "the old preview is gone"
@@ -149,14 +149,14 @@ def test_enabling_and_disabling_leaves_nothing_behind(panel: Any) -> None:
     import bpy
 
     import blender_addon
-    from blender_addon import registration, watching
+    from blender_addon import progress_timer, registration
 
     for _ in range(2):
         blender_addon.unregister()
         assert not hasattr(bpy.types.Scene, "gsopt")
         assert not hasattr(bpy.types.Object, "gsopt")
         assert registration.after_load not in bpy.app.handlers.load_post
-        assert not bpy.app.timers.is_registered(watching.tick)
+        assert not bpy.app.timers.is_registered(progress_timer.tick)
         assert not [name for name in dir(bpy.types) if name.startswith("GSOPT_")]
         blender_addon.register()
 
@@ -188,7 +188,7 @@ def test_an_edited_export_has_the_picture_of_what_was_kept(panel: Any, tmp_path:
 def test_each_scene_gets_what_it_asked_for(panel: Any, tmp_path: Path) -> None:
     import bpy
 
-    from blender_addon import watching
+    from blender_addon import progress_timer
 
     write_ply(tmp_path / "a.ply", random_splats(10))
     write_ply(tmp_path / "b.ply", random_splats(20))
@@ -197,7 +197,7 @@ def test_each_scene_gets_what_it_asked_for(panel: Any, tmp_path: Path) -> None:
         with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
             bpy.ops.gsopt.import_splats(filepath=str(tmp_path / name), wait=False)
     scenes[1].name = "renamed meanwhile"
-    assert watching.wait(lambda: not watching._loads, 30)
+    assert progress_timer.wait(lambda: not progress_timer._loads, 30)
     assert [scene.gsopt.job_import.state for scene in scenes] == ["DONE", "DONE"]
     assert [[len(o.data.vertices) for o in scene.objects] for scene in scenes] == [[10], [20]]
 

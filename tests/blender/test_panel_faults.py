@@ -113,9 +113,9 @@ def test_a_killed_run_is_told_and_can_go_on(panel: Any, tmp_path: Path) -> None:
     )
     bpy.ops.gsopt.launch(wait=False)
     bpy.ops.gsopt.follow(step=0, seconds=20.0)
-    from blender_addon import watching
+    from blender_addon import progress_timer
 
-    assert watching.wait(lambda: panel.run_status == "running", 20.0)
+    assert progress_timer.wait(lambda: panel.run_status == "running", 20.0)
     fails_with("A run is going on", bpy.ops.gsopt.launch)
     job.end(job.read_job(Path(panel.run_job)), force=True)
     bpy.ops.gsopt.follow(seconds=20.0)

@@ -132,10 +132,10 @@ def test_gsopt_sfm_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     class Asked(Exception):
         pass
 
-    def heard(photos: Path, out: Path, config: object, say: object) -> None:
+    def recorded(photos: Path, out: Path, config: object, report: object) -> None:
         raise Asked(photos, out, config.seed, config.threads)  # type: ignore[attr-defined]
 
-    monkeypatch.setattr(pipeline, "pose_photos", heard)
+    monkeypatch.setattr(pipeline, "pose_photos", recorded)
     words = arguments.poses(Path("python"), tmp_path, tmp_path / "a posed", 3, 1)
     with pytest.raises(Asked) as asked:
         sfm.main(words[4:])
@@ -144,7 +144,7 @@ def test_gsopt_sfm_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_gsopt_prompts_takes_the_flags(tmp_path: Path) -> None:
     tyro = pytest.importorskip("tyro")
-    from gsopt.cli.prompts import Flags
+    from gsopt.cli.prompts.generate import Flags
 
     writing = arguments.Writing("-- a chair; rm", "medicine", 6, "http://localhost:1/v1", "qwen", (tmp_path,))
     flags = tyro.cli(Flags, args=arguments.prompts(Path("python"), writing, tmp_path / "p.json")[4:])

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from blender_addon.core import run as runs
-from blender_addon.core.run import PIECE, Follower, earlier_runs, splats_of
+from blender_addon.core import run_follower
+from blender_addon.core.run_follower import PIECE, Follower, earlier_runs, splats_of
 
 
 def line(kind: str, seq: int = 0, v: int = 1, **fields: Any) -> bytes:
@@ -105,10 +105,10 @@ def test_100_mb_of_log_take_a_piece_per_poll(tmp_path: Path) -> None:
 
 
 def test_a_run_whose_beginning_was_skipped_is_over_once_it_is_silent(tmp_path: Path) -> None:
-    append(tmp_path, STARTED + line("progress", 1, step=1, total=100) * (runs.FAR_BEHIND // 64))
+    append(tmp_path, STARTED + line("progress", 1, step=1, total=100) * (run_follower.FAR_BEHIND // 64))
     follower = Follower(tmp_path)
     assert (follower.poll().status, follower.run.pid) == ("running", 0)
-    os.utime(tmp_path / "events.jsonl", (0, time.time() - runs.SILENCE - 1))
+    os.utime(tmp_path / "events.jsonl", (0, time.time() - run_follower.SILENCE - 1))
     assert follower.poll().status == "killed"
 
 
@@ -146,14 +146,14 @@ def test_a_killed_run_is_noticed_without_its_parent(tmp_path: Path) -> None:
 def test_a_run_that_never_began_is_over_after_a_while(tmp_path: Path) -> None:
     follower = Follower(tmp_path)
     assert follower.poll().status == "waiting"
-    os.utime(tmp_path, (0, time.time() - runs.SILENCE - 1))
+    os.utime(tmp_path, (0, time.time() - run_follower.SILENCE - 1))
     assert follower.poll().status == "error"
     append(tmp_path, STARTED)
     assert follower.poll().status == "running", "it was only slow"
 
 
 def test_another_program_with_the_same_process_id_is_not_the_run(tmp_path: Path) -> None:
-    if runs.jobs.birth(os.getpid()) is None:
+    if run_follower.jobs.birth(os.getpid()) is None:
         pytest.skip("this system does not say when a process began")
     event = json.loads(line("started", total=10, step=0, pid=os.getpid()))
     append(tmp_path, json.dumps({**event, "time": 1000.0}).encode() + b"\n")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from tyro.conf import Positional, arg
 
+from gsopt.cli.console import report, require_writable
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.errors import UsageError
@@ -17,7 +18,7 @@ from gsopt.errors import UsageError
 if TYPE_CHECKING:
     from gsopt.training.guided.compare_prompts import Arm, Comparison
 
-MOST = 12
+MAX_FILES = 12
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,6 @@ class Flags:
 
 def main(argv: Sequence[str]) -> int:
     """Compare and write the page; the exit code."""
-    from gsopt.cli.prompts import require_writable, say
-
     flags = tyro.cli(Flags, prog="gsopt prompts compare", args=list(argv))
     require_writable(flags.output, flags.overwrite)
     config = read_config(flags)
@@ -73,12 +72,12 @@ def main(argv: Sequence[str]) -> int:
     choice = choose(config.guidance)
     assert choice.prior is not None  # a weight was given: a prior that is not there is an error
     prior = open_prior(choice.prior, config.guidance)
-    say(f"prior {prior.name}")
+    report(f"prior {prior.name}")
     with one_torch_thread():
         scene = load_scene(config.data)
-        compared = compare_prompts(config, scene, make_backend("auto", flags.threads), prior, arms, say)
+        compared = compare_prompts(config, scene, make_backend("auto", flags.threads), prior, arms, report)
     write_page(flags, compared, prior.name)
-    say(f"{flags.output}: open it in a browser")
+    report(f"{flags.output}: open it in a browser")
     return 0
 
 
@@ -107,8 +106,10 @@ def read_arms(flags: Flags) -> list[Arm]:
     from gsopt.llm_prompts.schema import accepted_images, read_prompts
     from gsopt.training.guided.compare_prompts import Arm
 
-    if not 1 <= len(flags.files) <= MOST:
-        raise UsageError(f"`FILE` must be given 1 to {MOST} times, got {len(flags.files)}. Name prompts.json files.")
+    if not 1 <= len(flags.files) <= MAX_FILES:
+        raise UsageError(
+            f"`FILE` must be given 1 to {MAX_FILES} times, got {len(flags.files)}. Name prompts.json files."
+        )
     arms = [Arm("no guidance", (), weight=0.0), Arm("no prompts", (), weight=flags.lambda_sds)]
     names = distinct_names(flags.files)
     for name, file in zip(names, flags.files, strict=True):

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from synth import crew
+from synth import worker_pool
 from synth.cameras import Shot, shots
-from synth.items import Item, of_shapenet
-from synth.render import RECORD, render_object
+from synth.import_mesh import import_mesh, matrix_rows, mend_normals, normalization, vectors
+from synth.mesh_items import Item, of_shapenet
+from synth.render_object import RECORD, render_object
 from synth.settings import Settings
-from synth.stage import matrix_rows, mend_normals, normalization, stage_mesh, vectors
 from tiny_meshes import CENTERS, CUBE, RADIUS, TEXTURE_RGB
 
 from gsopt.errors import InputError
@@ -234,7 +234,7 @@ def test_an_environment_lights_the_object(bpy: Any, two_balls: Path, tmp_path: P
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".glb", ".fbx", ".blend"])
 def test_every_format_comes_in_at_the_same_place(bpy: Any, suffix: str, two_balls: Path, tmp_path: Path) -> None:
-    before = stage_mesh(bpy, two_balls, "sphere")
+    before = import_mesh(bpy, two_balls, "sphere")
     copy = tmp_path / ("copy" + suffix)
     exporters = {
         ".ply": bpy.ops.wm.ply_export,
@@ -244,9 +244,9 @@ def test_every_format_comes_in_at_the_same_place(bpy: Any, suffix: str, two_ball
         ".blend": bpy.ops.wm.save_as_mainfile,
     }
     exporters[suffix](filepath=str(copy))
-    after = stage_mesh(bpy, copy, "sphere")
+    after = import_mesh(bpy, copy, "sphere")
     for bound in (np.min, np.max):
-        extreme = [bound(staged.triangles.reshape(-1, 3), axis=0) for staged in (before, after)]
+        extreme = [bound(imported.triangles.reshape(-1, 3), axis=0) for imported in (before, after)]
         assert np.allclose(*extreme, atol=1e-5)
     # The copy is of the normalised mesh: nothing but the change of axes is left to do; the source was larger.
     assert np.allclose(np.linalg.det(after.normalized_from_mesh), 1.0, atol=1e-4)
@@ -256,17 +256,17 @@ def test_every_format_comes_in_at_the_same_place(bpy: Any, suffix: str, two_ball
 def test_faces_wound_both_ways_are_turned_alike(bpy: Any, tmp_path: Path) -> None:
     mesh = tmp_path / "cube.obj"
     mesh.write_text(CUBE.replace("f 5/1 6/2 7/3 8/4", "f 8/4 7/3 6/2 5/1"))
-    staged = stage_mesh(bpy, mesh, "sphere")
-    assert "wound" in staged.warnings[0]
-    a, b, c = staged.triangles.swapaxes(0, 1)
+    imported = import_mesh(bpy, mesh, "sphere")
+    assert "wound" in imported.warnings[0]
+    a, b, c = imported.triangles.swapaxes(0, 1)
     assert (np.cross(b - a, c - a) * (a + b + c)).sum(axis=1).min() > 0  # all outward
     mesh.write_text(CUBE)
-    assert stage_mesh(bpy, mesh, "sphere").warnings == []
+    assert import_mesh(bpy, mesh, "sphere").warnings == []
 
 
 def test_normals_that_point_away_from_their_face_take_its_own(bpy: Any, tmp_path: Path) -> None:
     (tmp_path / "cube.obj").write_text(CUBE)
-    stage_mesh(bpy, tmp_path / "cube.obj", "sphere")
+    import_mesh(bpy, tmp_path / "cube.obj", "sphere")
     shape = bpy.data.meshes[0]
     outward = np.repeat(vectors(shape.polygon_normals, "vector"), 4, axis=0)
     shape.normals_split_custom_set((np.roll(outward, 1, axis=1) - 0.3 * outward).tolist())
@@ -325,7 +325,7 @@ def test_a_killed_run_resumes_to_the_same_files(bpy: Any, two_balls: Path, tmp_p
     size = ["--views", "4", "--test-views", "0", "--resolution", "32", "--samples", "4", "--threads", "1", "--depth"]
 
     def command(out: str, *more: str) -> list[str]:
-        return [sys.executable, str(crew.SCRIPT), str(folder), "-o", str(tmp_path / out), *size, *more]
+        return [sys.executable, str(worker_pool.SCRIPT), str(folder), "-o", str(tmp_path / out), *size, *more]
 
     killed = subprocess.Popen(command("killed", "--workers", "2"), stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120

@@ -15,7 +15,7 @@ from PIL import Image
 from synth import captions, pixels
 from synth.cameras import look_at_origin, shot
 from synth.exr import read_passes
-from synth.items import Item
+from synth.mesh_items import Item
 from synth.points import SurfacePoints, sample_surface
 from synth.settings import Settings
 

@@ -14,11 +14,11 @@ from typing import Any
 
 from gsopt.errors import InputError
 from synth.cameras import shots
-from synth.crew import Job, Outcome, do_all
 from synth.export import write_json
-from synth.items import Item
-from synth.render import PARTIAL, RECORD
+from synth.mesh_items import Item
+from synth.render_object import PARTIAL, RECORD
 from synth.settings import Settings
+from synth.worker_pool import Job, Outcome, run_jobs
 
 VERSION = 1
 DATASET, FAILURES, TIMINGS, LOG = "dataset.json", "failures.json", "timings.json", "log.txt"
@@ -45,22 +45,22 @@ def run(
     open_folder(out, header, resume)
     todo = [item for item in items if not (out / item.id / RECORD).is_file()]
     failures = [failure for item in items if item not in todo for failure in changed(out, item)]
-    say(f"{len(items)} objects, {len(items) - len(todo)} of them rendered before, {workers} workers")
+    report(f"{len(items)} objects, {len(items) - len(todo)} of them rendered before, {workers} workers")
     jobs = [Job(item, settings, object_seed(seed, item.id), out / item.id) for item in todo]
     outcomes: list[Outcome] = []
     try:
         with (out / LOG).open("ab") as log:
-            for outcome in do_all(jobs, workers, log, time_limit):
+            for outcome in run_jobs(jobs, workers, log, time_limit):
                 outcomes.append(outcome)
-                say(f"[{len(outcomes)}/{len(jobs)}] {line_about(outcome)}")
+                report(f"[{len(outcomes)}/{len(jobs)}] {line_about(outcome)}")
     finally:
         failures += [failure(o.job.item, o.error) for o in outcomes if o.error]
         write_whole(out / FAILURES, sorted(failures, key=lambda f: str(f["id"])))
         write_whole(out / DATASET, header | {"objects": sorted(records(out), key=lambda r: str(r["id"]))})
         write_whole(out / TIMINGS, timings(outcomes, time.perf_counter() - began))
-    say(f"{len(items) - len(failures)} of {len(items)} objects are in {out}")
+    report(f"{len(items) - len(failures)} of {len(items)} objects are in {out}")
     for lost in failures:
-        say(f"failed: {lost['id']}: {lost['reason']}")
+        report(f"failed: {lost['id']}: {lost['reason']}")
     return FAILED if failures else 0
 
 
@@ -79,7 +79,7 @@ def files_used(settings: Settings) -> dict[str, str]:
     return found
 
 
-def say(text: str) -> None:
+def report(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 

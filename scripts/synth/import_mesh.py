@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gsopt.errors import InputError
+from synth.coincident_faces import separate_coincident_faces
 from synth.meshfile import check_mesh, find_near
-from synth.twins import part_twins
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -26,8 +26,8 @@ SOLIDS = ("MESH", "CURVE", "SURFACE", "FONT", "META")
 
 
 @dataclass(frozen=True)
-class Staged:
-    """What stands on the stage."""
+class ImportedMesh:
+    """The triangles of a mesh in Blender's scene, normalized."""
 
     triangles: Float[np.ndarray, "T 3 3"]
     """World corners of every triangle."""
@@ -36,11 +36,11 @@ class Staged:
     warnings: list[str]
 
 
-def stage_mesh(bpy: Any, mesh: Path, normalize: str) -> Staged:
+def import_mesh(bpy: Any, mesh: Path, normalize: str) -> ImportedMesh:
     """Fill an empty scene with the mesh. InputError when it cannot be read or has nothing to render."""
     warnings = check_mesh(mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    import_mesh(bpy, mesh)
+    read_mesh_file(bpy, mesh)
     for other in [o for o in bpy.data.objects if o.type in ("CAMERA", "LIGHT", "LIGHT_PROBE", "SPEAKER")]:
         bpy.data.objects.remove(other)
     warnings += mend_textures(bpy, mesh)
@@ -50,7 +50,7 @@ def stage_mesh(bpy: Any, mesh: Path, normalize: str) -> Staged:
     for shape in bpy.data.meshes:
         mended = mend_normals(bpy, shape, mesh.suffix.lower() in UNSHADED)
         turned, wrong = turned + mended.turned, wrong + mended.wrong
-        twins += part_twins(shape)
+        twins += separate_coincident_faces(shape)
         if not any(shape.materials):
             shape.materials.append(plain_material(bpy, shape))
     if turned:
@@ -70,10 +70,10 @@ def stage_mesh(bpy: Any, mesh: Path, normalize: str) -> Staged:
     bpy.context.scene.collection.objects.link(anchor)
     anchor.matrix_world = matrix_rows(matrix)
     up = Z_UP_FROM_Y_UP if mesh.suffix.lower() in Y_UP else np.eye(4)
-    return Staged(imported @ matrix[:3, :3].T + matrix[:3, 3], matrix @ up, warnings)
+    return ImportedMesh(imported @ matrix[:3, :3].T + matrix[:3, 3], matrix @ up, warnings)
 
 
-def import_mesh(bpy: Any, mesh: Path) -> None:
+def read_mesh_file(bpy: Any, mesh: Path) -> None:
     importers = {
         ".obj": bpy.ops.wm.obj_import,
         ".ply": bpy.ops.wm.ply_import,

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from gsopt.errors import GsoptError
-from synth.items import Item
+from synth.mesh_items import Item
 from synth.settings import Settings
 
 ANSWER = "synth_views answers "
@@ -94,7 +94,7 @@ class Worker:
             self.process.wait()
 
 
-def do_all(jobs: Iterable[Job], workers: int, log: IO[bytes], time_limit: float) -> Iterator[Outcome]:
+def run_jobs(jobs: Iterable[Job], workers: int, log: IO[bytes], time_limit: float) -> Iterator[Outcome]:
     """Outcomes as they come, from `workers` processes. Closing the iterator ends the workers."""
     idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
     crew = [Worker(log, time_limit) for _ in range(workers)]
@@ -143,7 +143,7 @@ def from_json(line: str) -> Job:
 
 def serve() -> None:
     """Be a worker: never returns."""
-    from synth.render import render_object
+    from synth.render_object import render_object
 
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

@@ -7,14 +7,14 @@ from typing import Any
 
 import bpy
 
-from . import watching
+from . import progress_timer
 from .core.errors import GsoptError
 
 LONG = 24 * 3600.0
 """Seconds that an operator waits at most."""
 
 
-class Telling:
+class ReportingOperator:
     """Mixed into operators; they implement `do`, which may raise a GsoptError."""
 
     bl_options = {"REGISTER"}  # noqa: RUF012  Blender's way
@@ -32,7 +32,7 @@ class Telling:
         return {"FINISHED"}
 
 
-class Waiting(Telling):
+class WaitingOperator(ReportingOperator):
     """Operators that start something: without a window they wait for its end, as scripts expect."""
 
     wait: bpy.props.BoolProperty(  # type: ignore[valid-type]
@@ -48,6 +48,6 @@ class Waiting(Telling):
     def settle(self, going_on: Callable[[], bool], problem: Callable[[], str]) -> None:
         """Without a window: wait until it is over. GsoptError with the problem that ended it."""
         if self.waits:
-            watching.wait(lambda: not going_on(), LONG)
+            progress_timer.wait(lambda: not going_on(), LONG)
             if problem():
                 raise GsoptError(problem())

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsopt.errors import InputError, MissingDependency, UsageError
-from synth import captions, pixels, studio
+from synth import captions, lighting_and_render, pixels
 from synth.cameras import Shot, shots
 from synth.export import export, write_json
 from synth.exr import read_passes
-from synth.items import Item
+from synth.import_mesh import ImportedMesh, import_mesh
+from synth.mesh_items import Item
 from synth.points import SurfacePoints
 from synth.settings import SPLITS, Settings
-from synth.stage import Staged, stage_mesh
 
 if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8
@@ -76,8 +76,8 @@ def load_bpy() -> Any:
 
     if not bpy.app.background:
         raise UsageError(
-            "Rendering an object here would replace the open Blender file. Call `synth.library.run`, which starts "
-            "Blender in the background."
+            "Rendering an object here would replace the open Blender file. Call `synth.render_dataset.run`, which "
+            "starts Blender in the background."
         )
     return bpy
 
@@ -93,15 +93,17 @@ def render_object(mesh: Path, settings: Settings, seed: int, out: Path, item: It
     timing = Timing()
     with new_folder(out) as folder:
         with clocked(timing, "stage"):
-            staged = stage_mesh(bpy, mesh, settings.normalize)
-            studio.light(bpy, settings)
-            studio.set_up_renderer(bpy, settings)
+            imported = import_mesh(bpy, mesh, settings.normalize)
+            lighting_and_render.light(bpy, settings)
+            lighting_and_render.set_up_renderer(bpy, settings)
             views = shots(settings, seed)
-        gathered = render_views(bpy, settings, views, seed, staged, folder, timing)
+        gathered = render_views(bpy, settings, views, seed, imported, folder, timing)
         with clocked(timing, "write"):
             if not gathered.opaque:
                 raise InputError(f"Every view of {mesh} is empty: its materials are transparent. Repair them.")
-            record = describe(mesh, item, views, seed, staged, gathered, studio.renderer_name(bpy, settings))
+            record = describe(
+                mesh, item, views, seed, imported, gathered, lighting_and_render.renderer_name(bpy, settings)
+            )
             cloud = gathered.points.found() if gathered.points else None
             origin = {"normalized_from_mesh": record["normalized_from_mesh"], "id": item.id}
             export(folder, settings, views, cloud, origin)
@@ -117,17 +119,23 @@ def render_object(mesh: Path, settings: Settings, seed: int, out: Path, item: It
 
 
 def render_views(
-    bpy: Any, settings: Settings, views: Sequence[Shot], seed: int, staged: Staged, folder: Path, timing: Timing
+    bpy: Any,
+    settings: Settings,
+    views: Sequence[Shot],
+    seed: int,
+    imported: ImportedMesh,
+    folder: Path,
+    timing: Timing,
 ) -> Views:
     """Render every view and write its files; view i draws its noise from `seed + i`."""
-    camera = studio.add_camera(bpy)
-    points = SurfacePoints(staged.triangles, settings.points, seed) if settings.points else None
+    camera = lighting_and_render.add_camera(bpy)
+    points = SurfacePoints(imported.triangles, settings.points, seed) if settings.points else None
     gathered = Views(points)
     with tempfile.TemporaryDirectory(prefix="synth_views_") as scratch:
         for number, view in enumerate(views):
             with clocked(timing, "render"):
-                studio.aim(camera, view, settings.resolution)
-                studio.photograph(bpy, seed + number, Path(scratch) / "view.exr")
+                lighting_and_render.aim(camera, view, settings.resolution)
+                lighting_and_render.photograph(bpy, seed + number, Path(scratch) / "view.exr")
             with clocked(timing, "write"):
                 keep_view(settings, view, read_passes(Path(scratch) / "view.exr"), folder, gathered)
     return gathered
@@ -180,7 +188,13 @@ def save_npy(path: Path, values: np.ndarray) -> None:
 
 
 def describe(
-    mesh: Path, item: Item, views: Sequence[Shot], seed: int, staged: Staged, gathered: Views, renderer: str
+    mesh: Path,
+    item: Item,
+    views: Sequence[Shot],
+    seed: int,
+    imported: ImportedMesh,
+    gathered: Views,
+    renderer: str,
 ) -> dict[str, Any]:
     """The record of an object: what it is, how it was rendered, and how to undo the normalisation."""
     caption = captions.object_caption(item, captions.total_colors(gathered.colors))
@@ -189,12 +203,12 @@ def describe(
         "mesh": mesh.name,
         "mesh_bytes": mesh.stat().st_size,
         "mesh_sha256": hashlib.sha256(mesh.read_bytes()).hexdigest(),
-        "triangles": len(staged.triangles),
-        "normalized_from_mesh": staged.normalized_from_mesh.tolist(),
+        "triangles": len(imported.triangles),
+        "normalized_from_mesh": imported.normalized_from_mesh.tolist(),
         "views": {split: sum(view.split == split for view in views) for split in SPLITS},
         "seed": seed,
         "renderer": renderer,
-        "warnings": staged.warnings,
+        "warnings": imported.warnings,
     }
 
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 import synth_views
-from synth import crew, library, render
-from synth.crew import Job, from_json, to_json
-from synth.items import Item
-from synth.library import run
-from synth.render import PARTIAL, RECORD, new_folder
+from synth import render_dataset, render_object, worker_pool
+from synth.mesh_items import Item
+from synth.render_dataset import run
+from synth.render_object import PARTIAL, RECORD, new_folder
 from synth.settings import Settings
+from synth.worker_pool import Job, from_json, to_json
 
 from gsopt.errors import InputError, UsageError
 
@@ -27,7 +27,7 @@ SETTINGS = Settings(views=1, resolution=(8, 8), formats=("nerf", "colmap"), elev
 PRETENDER = """
     import json, os, sys, time
     sys.path[:0] = {paths!r}
-    from synth.crew import ANSWER, from_json
+    from synth.worker_pool import ANSWER, from_json
     print("Blender talks", flush=True)
     for line in sys.stdin:
         job = from_json(line)
@@ -55,9 +55,9 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the pretending workers note each job."""
     script, calls = tmp_path / "pretender.py", tmp_path / "calls.txt"
     calls.touch()
-    paths = [str(crew.SCRIPT.parent), str(crew.SCRIPT.parent.parent)]
+    paths = [str(worker_pool.SCRIPT.parent), str(worker_pool.SCRIPT.parent.parent)]
     script.write_text(textwrap.dedent(PRETENDER.format(paths=paths, calls=str(calls))))
-    monkeypatch.setattr(crew, "worker_command", lambda: [sys.executable, str(script)])
+    monkeypatch.setattr(worker_pool, "worker_command", lambda: [sys.executable, str(script)])
     return calls
 
 
@@ -84,7 +84,7 @@ def test_one_bad_mesh_never_stops_the_run(calls: Path, tmp_path: Path) -> None:
 def test_a_mesh_that_takes_too_long_costs_no_other(calls: Path, tmp_path: Path) -> None:
     jobs = [Job(i, SETTINGS, 0, tmp_path / "out" / i.id) for i in meshes(tmp_path, a="hang", b="x")]
     with (tmp_path / "log").open("wb") as log:
-        worker = crew.Worker(log, time_limit=1.0)
+        worker = worker_pool.Worker(log, time_limit=1.0)
         assert "longer than 1 s" in str(worker.do(jobs[0]).error)
         worker.time_limit = 600.0
         assert worker.do(jobs[1]).error is None
@@ -175,7 +175,7 @@ def test_an_interrupted_run_records_what_it_has(calls: Path, tmp_path: Path, mon
         if text.startswith("[1/"):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(library, "say", interrupt)
+    monkeypatch.setattr(render_dataset, "report", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run(meshes(tmp_path, a="x", b="y", c="z"), SETTINGS, 0, tmp_path / "out")
     monkeypatch.undo()
@@ -272,7 +272,7 @@ def test_wrong_numbers_are_usage_errors(wrong: str) -> None:
 def test_without_blender_one_line_says_what_to_install(
     calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(render, "find_spec", lambda name: None)
+    monkeypatch.setattr(render_object, "find_spec", lambda name: None)
     monkeypatch.delitem(sys.modules, "bpy", raising=False)
     meshes(tmp_path, a="x")
     assert synth_views.main(["x.py", str(tmp_path / "a.obj"), "-o", str(tmp_path / "out")]) == 2
@@ -283,7 +283,7 @@ def test_without_blender_one_line_says_what_to_install(
 
 def test_a_missing_mesh_ends_with_its_name_and_exit_code_3(bpy: Any, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, str(crew.SCRIPT), "стул 3.obj", "-o", str(tmp_path / "out")],
+        [sys.executable, str(worker_pool.SCRIPT), "стул 3.obj", "-o", str(tmp_path / "out")],
         capture_output=True,
         text=True,
         check=False,

@@ -17,7 +17,7 @@ OPPOSITE = -0.999
 """Most cosine between the normals of two sides of a sheet."""
 
 
-def part_twins(shape: Any) -> int:
+def separate_coincident_faces(shape: Any) -> int:
     """Move faces that lie on a face of opposite normal outward by `GAP`; returns how many there are.
 
     Modelling tools close sheets so, often with other triangles on either side. A renderer's shadow rays start on one

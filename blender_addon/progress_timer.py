@@ -1,4 +1,4 @@
-"""The timer: looks at everything that runs outside, for a few milliseconds at a time, and tells the panel.
+"""The timer: polls everything that runs outside, for a few milliseconds at a time, and updates the panel.
 
 State that a timer keeps lies here, keyed by scene; what must survive Blender lies in the scene's properties and in the
 folders of jobs and runs.
@@ -6,7 +6,6 @@ folders of jobs and runs.
 
 from __future__ import annotations
 
-import json
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -16,10 +15,10 @@ from typing import Any
 import bpy
 
 from . import loading, splat_object
-from .core import dataset, interpreter, job, prompts
-from .core import run as runs
+from .core import dataset, job, run_follower
 from .core.errors import GsoptError
 from .core.statistics import Summary
+from .job_results import FINISH
 
 PAUSE, BUSY = 0.4, 0.02
 """Seconds between two looks, and while splats are handed over."""
@@ -31,13 +30,13 @@ LIVE = "gsopt_live"
 TIMES: list[float] = []
 """Seconds of CPU that each tick took from the main thread, the newest last."""
 
-_followers: dict[int, runs.Follower] = {}
+_followers: dict[int, run_follower.Follower] = {}
 _loads: dict[tuple[int, str], loading.Loading] = {}
 _kept: dict[int, list[Any]] = {}
 
 
 def watch() -> None:
-    """Make sure that the timer runs."""
+    """Register the timer unless it runs."""
     if not bpy.app.background and not bpy.app.timers.is_registered(tick):
         bpy.app.timers.register(tick, first_interval=0.05, persistent=True)
 
@@ -97,8 +96,8 @@ def redraw() -> None:
                     region.tag_redraw()
 
 
-def tell(entry: Any, **values: Any) -> None:
-    """Write what has changed: every write makes Blender look whether something must be drawn again."""
+def assign_changed(entry: Any, **values: Any) -> None:
+    """Assign only values that differ, because every assignment makes Blender check for redraws."""
     for name, value in values.items():
         if getattr(entry, name) != value:
             setattr(entry, name, value)
@@ -124,7 +123,7 @@ def before_undo() -> None:
 def after_undo() -> None:
     for scene in bpy.data.scenes:
         for (owner, name), value in zip(lasting(scene.gsopt), _kept.pop(scene.session_uid, ()), strict=False):
-            tell(owner, **{name: value})
+            assign_changed(owner, **{name: value})
     watch()
 
 
@@ -158,9 +157,9 @@ def look_at_job(scene: Any, kind: str, entry: Any) -> None:
         lives = job.alive(work)
         if kind == "dataset" and work.total:
             made = min(dataset.pictures(Path(work.product)), work.total)
-            tell(entry, share=made / work.total, message=f"{made} of {work.total} views")
+            assign_changed(entry, share=made / work.total, message=f"{made} of {work.total} views")
         elif lives:
-            tell(entry, message=job.last_words(work))
+            assign_changed(entry, message=job.last_words(work))
         if not lives:
             FINISH[kind](scene, work)
             entry.state, entry.share = "DONE", 1.0
@@ -168,62 +167,6 @@ def look_at_job(scene: Any, kind: str, entry: Any) -> None:
     except GsoptError as error:
         entry.state, entry.message = "FAILED", str(error)
         scene.gsopt.message = str(error)
-
-
-def finish_dataset(scene: Any, work: job.Job) -> None:
-    data = dataset.finished(Path(work.product))
-    if data is None:
-        raise GsoptError(dataset.failure(Path(work.product)) or job.complaint(work))
-    scene.gsopt.dataset, scene.gsopt.source = str(data), "DATASET"
-
-
-def finish_poses(scene: Any, work: job.Job) -> None:
-    if not (Path(work.product) / "transforms.json").is_file():
-        raise GsoptError(job.complaint(work))
-    scene.gsopt.dataset, scene.gsopt.source = work.product, "DATASET"
-
-
-def finish_prompts(scene: Any, work: job.Job) -> None:
-    if not Path(work.product).is_file():
-        raise GsoptError(job.complaint(work))
-    found = prompts.read_prompts(Path(work.product))
-    about = {key: found.rest[key] for key in ("notes", "object", "domain") if key in found.rest}
-    scene.gsopt.prompts_rest = json.dumps({**json.loads(scene.gsopt.prompts_rest or "{}"), **about})
-    scene.gsopt.proposals.clear()
-    for prompt in found.prompts:
-        fill_prompt(scene.gsopt.proposals.add(), prompt)
-
-
-def finish_doctor(scene: Any, work: job.Job) -> None:
-    output = job.tail(Path(work.folder) / job.OUTPUT)
-    try:
-        scene.gsopt.doctor = interpreter.read_answer(output, work.arguments[0]).line
-    except GsoptError as error:
-        scene.gsopt.doctor = str(error)
-        raise
-
-
-FINISH: dict[str, Callable[[Any, job.Job], None]] = {
-    "dataset": finish_dataset,
-    "poses": finish_poses,
-    "prompts": finish_prompts,
-    "doctor": finish_doctor,
-}
-
-
-def fill_prompt(entry: Any, prompt: prompts.Prompt) -> None:
-    """A prompt of a file into an entry of the panel."""
-    for name in ("text", "weight", "view", "polarity", "source", "rationale"):
-        setattr(entry, name, getattr(prompt, name))
-    entry.score = -2.0 if prompt.score is None else prompt.score
-
-
-def prompt_of(entry: Any) -> prompts.Prompt:
-    """The other way round. InputError for an entry that is no prompt."""
-    names = ("text", "weight", "view", "polarity", "source", "rationale")
-    values = {name: getattr(entry, name) for name in names}
-    values["weight"] = round(values["weight"], 6)
-    return prompts.Prompt(**values, score=None if entry.score < -1 else round(entry.score, 6))
 
 
 # The run
@@ -236,11 +179,11 @@ def attach(scene: Any, run: Path, work: job.Job | None = None, told: int = 0) ->
     settings.run_status, settings.run_message, settings.run_preview = "waiting", "", ""
     settings.run_step = settings.run_total = settings.run_count = 0
     settings.run_psnr = settings.run_eta = -1.0
-    _followers[scene.session_uid] = runs.Follower(run, work, told)
+    _followers[scene.session_uid] = run_follower.Follower(run, work, told)
     watch()
 
 
-def follower(scene: Any) -> runs.Follower | None:
+def follower(scene: Any) -> run_follower.Follower | None:
     """That of the scene's run; made anew after a file was opened."""
     settings = scene.gsopt
     if not settings.run_path or not settings.run_status:
@@ -251,7 +194,7 @@ def follower(scene: Any) -> runs.Follower | None:
             work = job.read_job(Path(settings.run_job)) if settings.run_job else None
         except GsoptError:
             work = None  # the folder of the job is gone; the events name the process
-        known = _followers[scene.session_uid] = runs.Follower(Path(settings.run_path), work)
+        known = _followers[scene.session_uid] = run_follower.Follower(Path(settings.run_path), work)
     return known
 
 
@@ -261,8 +204,10 @@ def look_at_run(scene: Any) -> None:
         return
     run, settings = found.poll(), scene.gsopt
     psnr, eta = (-1.0 if value is None else value for value in (run.psnr, run.eta))
-    tell(settings, run_status=run.status, run_step=run.step, run_total=run.total, run_count=run.count)
-    tell(settings, run_psnr=psnr, run_eta=eta, run_message=run.problem or (run.messages[-1] if run.messages else ""))
+    assign_changed(settings, run_status=run.status, run_step=run.step, run_total=run.total, run_count=run.count)
+    assign_changed(
+        settings, run_psnr=psnr, run_eta=eta, run_message=run.problem or (run.messages[-1] if run.messages else "")
+    )
     if settings.live and run.preview not in ("", settings.run_preview) and (scene.session_uid, "live") not in _loads:
         settings.run_preview = run.preview
         _loads[scene.session_uid, "live"] = loading.Loading(Path(run.preview), settings.live_most, show_live)
@@ -306,7 +251,7 @@ def look_at_loading(scene: Any) -> None:
                 state = "DONE"
         finally:
             if key[1] == "import":
-                tell(entry, state=state, share=found.share, message=found.error or found.path.name)
+                assign_changed(entry, state=state, share=found.share, message=found.error or found.path.name)
         if state == "FAILED":
             raise GsoptError(found.error)
 

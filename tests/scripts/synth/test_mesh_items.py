@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synth import items
+from synth import mesh_items
 from synth.categories import SHAPENET
-from synth.items import Item
+from synth.mesh_items import Item
 from synth.meshfile import MAX_BYTES, check_mesh, find_near
 
 from gsopt.errors import InputError
@@ -22,16 +22,16 @@ def test_a_folder_gives_every_mesh_below_it(tmp_path: Path) -> None:
     for name in ("b.OBJ", "sub/a.glb", "sub/deep/c.stl", "sub/notes.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("x")
-    assert [item.id for item in items.of_paths([tmp_path])] == ["b", "sub/a", "sub/deep/c"]
+    assert [item.id for item in mesh_items.of_paths([tmp_path])] == ["b", "sub/a", "sub/deep/c"]
     for name in ("b.glb", "sub.ply"):  # would be the second b, and a folder that another object lies in
         (tmp_path / name).write_text("x")
-    assert [i.id for i in items.unique(items.of_paths([tmp_path]))] == [
+    assert [i.id for i in mesh_items.unique(mesh_items.of_paths([tmp_path]))] == [
         "b.OBJ", "b.glb", "sub/a", "sub/deep/c", "sub.ply"
     ]  # fmt: skip
     void = tmp_path / "void"
     void.mkdir()
     with pytest.raises(InputError, match="no mesh"):
-        list(items.of_paths([void]))
+        list(mesh_items.of_paths([void]))
 
 
 def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,9 +40,9 @@ def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path: Path, monkey
 
     monkeypatch.setattr(Path, "iterdir", refuse)
     with pytest.raises(InputError, match="Permission denied"):
-        list(items.of_paths([tmp_path]))
+        list(mesh_items.of_paths([tmp_path]))
     with pytest.raises(InputError, match="Permission denied"):
-        list(items.of_shapenet(tmp_path, ()))
+        list(mesh_items.of_shapenet(tmp_path, ()))
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path: Path, monkey
     ],
 )
 def test_ids_are_paths_that_stay_inside(text: str, safe: str) -> None:
-    assert items.safe_id(text) == safe
+    assert mesh_items.safe_id(text) == safe
 
 
 def test_two_objects_never_share_a_place() -> None:
@@ -68,23 +68,23 @@ def test_two_objects_never_share_a_place() -> None:
     nested = [Item("a", Path("a.obj")), Item("a/b", Path("b.obj"))]
     for clash in (same, nested, []):
         with pytest.raises(InputError):
-            items.unique(clash)
-    assert len(items.unique([Item("a", Path("a")), Item("ab/c", Path("b"))])) == 2
+            mesh_items.unique(clash)
+    assert len(mesh_items.unique([Item("a", Path("a")), Item("ab/c", Path("b"))])) == 2
 
 
 def test_shapenet_knows_its_models(shapenet: Path) -> None:
-    (found,) = items.of_shapenet(shapenet, ())
+    (found,) = mesh_items.of_shapenet(shapenet, ())
     assert (found.id, found.category, found.mesh.name) == ("03001627/abc", "chair", "model_normalized.obj")
     assert len(SHAPENET) == 55
     (shapenet / "taxonomy.json").write_text(json.dumps([{"synsetId": "03001627", "name": "throne,chair"}]))
-    (found,) = items.of_shapenet(shapenet, ("03001627",))
+    (found,) = mesh_items.of_shapenet(shapenet, ("03001627",))
     assert found.category == "throne"
     old = shapenet / "02691156" / "xyz"
     old.mkdir(parents=True)
     (old / "model.obj").write_text("x")
-    assert [i.mesh.name for i in items.of_shapenet(shapenet, ())] == ["model.obj", "model_normalized.obj"]
+    assert [i.mesh.name for i in mesh_items.of_shapenet(shapenet, ())] == ["model.obj", "model_normalized.obj"]
     with pytest.raises(InputError, match="99999999"):
-        list(items.of_shapenet(shapenet, ("99999999",)))
+        list(mesh_items.of_shapenet(shapenet, ("99999999",)))
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_shapenet_knows_its_models(shapenet: Path) -> None:
 )
 def test_manifests_of_every_kind_say_the_same(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    assert list(items.of_manifest(tmp_path / name)) == [
+    assert list(mesh_items.of_manifest(tmp_path / name)) == [
         Item("x/a", tmp_path / "sub" / "a.obj", name="A", license="CC0"),
     ]
 
@@ -107,7 +107,7 @@ def test_manifests_of_every_kind_say_the_same(name: str, text: str, tmp_path: Pa
 def test_a_broken_manifest_is_an_input_error(text: str, tmp_path: Path) -> None:
     (tmp_path / "m.json").write_text(text)
     with pytest.raises(InputError, match=r"m\.json"):
-        list(items.of_manifest(tmp_path / "m.json"))
+        list(mesh_items.of_manifest(tmp_path / "m.json"))
 
 
 # Files

@@ -10,8 +10,8 @@ import numpy as np
 
 from gsopt.errors import GsoptError, InputError
 from synth.cameras import Shot, look_at_origin
+from synth.import_mesh import load_image, matrix_rows
 from synth.settings import Settings
-from synth.stage import load_image, matrix_rows
 
 # Position and side of the square (units of the unit sphere), power (W): key, fill, back, and a weak one from below.
 # A matte surface that faces one of power P from distance d has the radiance albedo * P / (pi * d)².

@@ -1,0 +1,67 @@
+"""Reads the results of finished programs into the scene's properties."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .core import dataset, interpreter, job, prompts
+from .core.errors import GsoptError
+
+
+def finish_dataset(scene: Any, work: job.Job) -> None:
+    data = dataset.finished(Path(work.product))
+    if data is None:
+        raise GsoptError(dataset.failure(Path(work.product)) or job.complaint(work))
+    scene.gsopt.dataset, scene.gsopt.source = str(data), "DATASET"
+
+
+def finish_poses(scene: Any, work: job.Job) -> None:
+    if not (Path(work.product) / "transforms.json").is_file():
+        raise GsoptError(job.complaint(work))
+    scene.gsopt.dataset, scene.gsopt.source = work.product, "DATASET"
+
+
+def finish_prompts(scene: Any, work: job.Job) -> None:
+    if not Path(work.product).is_file():
+        raise GsoptError(job.complaint(work))
+    found = prompts.read_prompts(Path(work.product))
+    about = {key: found.rest[key] for key in ("notes", "object", "domain") if key in found.rest}
+    scene.gsopt.prompts_rest = json.dumps({**json.loads(scene.gsopt.prompts_rest or "{}"), **about})
+    scene.gsopt.proposals.clear()
+    for prompt in found.prompts:
+        fill_prompt(scene.gsopt.proposals.add(), prompt)
+
+
+def finish_doctor(scene: Any, work: job.Job) -> None:
+    output = job.tail(Path(work.folder) / job.OUTPUT)
+    try:
+        scene.gsopt.doctor = interpreter.read_answer(output, work.arguments[0]).line
+    except GsoptError as error:
+        scene.gsopt.doctor = str(error)
+        raise
+
+
+FINISH: dict[str, Callable[[Any, job.Job], None]] = {
+    "dataset": finish_dataset,
+    "poses": finish_poses,
+    "prompts": finish_prompts,
+    "doctor": finish_doctor,
+}
+
+
+def fill_prompt(entry: Any, prompt: prompts.Prompt) -> None:
+    """Copy a prompt of a file into an entry of the panel."""
+    for name in ("text", "weight", "view", "polarity", "source", "rationale"):
+        setattr(entry, name, getattr(prompt, name))
+    entry.score = -2.0 if prompt.score is None else prompt.score
+
+
+def prompt_of(entry: Any) -> prompts.Prompt:
+    """Returns the prompt of an entry of the panel. InputError for an entry that is no prompt."""
+    names = ("text", "weight", "view", "polarity", "source", "rationale")
+    values = {name: getattr(entry, name) for name in names}
+    values["weight"] = round(values["weight"], 6)
+    return prompts.Prompt(**values, score=None if entry.score < -1 else round(entry.score, 6))

@@ -1,0 +1,177 @@
+"""`gsopt prompts --notes TEXT`: writes prompts.json from an expert's notes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from tyro.conf import arg
+
+from gsopt.cli.console import report, require_writable
+from gsopt.cli.prompts.review import review_file
+from gsopt.errors import UsageError
+
+if TYPE_CHECKING:
+    from gsopt.llm_prompts.generate import Job, Result
+    from gsopt.llm_prompts.reference_images import Drawing
+    from gsopt.llm_prompts.schema import PromptSet
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Write prompts.json from an expert's notes, with a language model or a template. `gsopt prompts review FILE` goes
+    through a file again, `gsopt prompts compare DATA FILE ...` tries files on a scene."""
+
+    notes: Annotated[str, arg(metavar="TEXT")]
+    """What the object is, in the expert's words; best in English, the object first: "femur, osteoporotic, CT"."""
+    domain: Annotated[str, arg(metavar="NAME|FILE")] = "generic"
+    """generic, medicine, robotics, arvr, environment, or a template of your own (Markdown)."""
+    images: Annotated[tuple[Path, ...], arg(metavar="PATH ...")] = ()
+    """Photos, folders of photos or a dataset: for models that see, and to score the prompts."""
+    category: Annotated[str, arg(metavar="NOUN")] = ""
+    """What the object is called; found in the notes when not given."""
+    n: Annotated[int, arg(aliases=["-n"], metavar="N")] = 8
+    """Prompts to write beside the expert's own words; from 6 on one each is for front, side, back and top."""
+    negatives: Annotated[int, arg(metavar="N")] = 3
+    """Negative prompts to write."""
+    llm: Annotated[str, arg(metavar="URL|none")] = "none"
+    """Base address of an OpenAI-compatible server (ollama: http://localhost:11434/v1); none: the template. A key is
+    read from the environment variable GSOPT_LLM_KEY."""
+    model: Annotated[str, arg(metavar="NAME")] = ""
+    """The server's model; needed where it has several."""
+    timeout: Annotated[float, arg(metavar="SECONDS")] = 120.0
+    """For all requests to the server together."""
+    temperature: float = 0.8
+    """Of the language model; 0 always takes the likeliest word."""
+    seed: int = 0
+    """For the language model, where it takes one, and for pictures."""
+    price: Annotated[str, arg(metavar="IN,OUT")] = ""
+    """Price of a million tokens in and out, to be told the cost."""
+    fallback: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Let the template step in where the model cannot be had or gives nothing usable; the file says so."""
+    prior: Annotated[str, arg(metavar="PRIOR")] = "auto"
+    """Whose tokenizer counts, whose CLIP scores, whose pipeline draws: embedded, sd21, a diffusers folder, a hub id."""
+    clip: Annotated[str, arg(metavar="FOLDER")] = ""
+    """A CLIP model that scores the prompts, where the prior has none."""
+    review: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Go through the prompts one by one: accept, edit, reject."""
+    images_from_prompts: Annotated[int, arg(metavar="K")] = 0
+    """Make reference images with the prior's text-to-image pipeline; they guide only after a review accepted them."""
+    image_steps: int = 25
+    """Denoising steps of such an image."""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="FILE")] = Path("prompts.json")
+    """Where the prompts go; a model's answers go to FILE.raw.json beside it."""
+    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Replace the file if it exists."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Write the prompts; the exit code."""
+    return write(tyro.cli(Flags, prog="gsopt prompts", args=list(argv)))
+
+
+def write(flags: Flags) -> int:
+    """Make the prompts, let the expert see them, write the file."""
+    from gsopt.llm_prompts.generate import make_prompts, raw_file, require_model_prompts, write_record
+    from gsopt.llm_prompts.reference_images import Drawing
+    from gsopt.llm_prompts.schema import write_set
+
+    prices = read_prices(flags.price)
+    drawing = Drawing(flags.images_from_prompts, flags.seed, flags.image_steps)
+    require_writable(flags.output, flags.overwrite)
+    job = read_job(flags)
+    result = make_prompts(job, report)
+    made = result.made
+    raw = raw_file(flags.output)
+    if result.record is not None:
+        write_record(raw, result.record)
+        made = replace(made, made=replace(made.made, raw=raw.name)) if made.made else made
+        report(spent(result, prices))
+    require_model_prompts(result, job, raw)
+    made = with_pictures(made, flags, drawing)
+    show(made)
+    write_set(flags.output, made)
+    report(f"{flags.output}: {len(made.prompts)} prompts, tokens by {result.counter.name}")
+    if flags.review:
+        return review_file(flags.output, made)
+    report(f"not reviewed; go through them with: gsopt prompts review {flags.output}")
+    return 0
+
+
+def read_job(flags: Flags) -> Job:
+    """What is to be made."""
+    from gsopt.llm_prompts.generate import Job
+
+    return Job(
+        notes=flags.notes,
+        domain=flags.domain,
+        category=flags.category,
+        images=flags.images,
+        n=flags.n,
+        negatives=flags.negatives,
+        llm=flags.llm,
+        model=flags.model,
+        timeout=flags.timeout,
+        temperature=flags.temperature,
+        seed=flags.seed,
+        fallback=flags.fallback,
+        prior=flags.prior,
+        clip=flags.clip,
+    )
+
+
+def with_pictures(made: PromptSet, flags: Flags, drawing: Drawing) -> PromptSet:
+    """With the pictures that were asked for; a prior that makes none says why."""
+    if not drawing.count:
+        return made
+    from gsopt.llm_prompts.reference_images import PAGE, illustrate
+
+    folder = flags.output.with_name(f"{flags.output.stem}-images")
+    pictures, reason = illustrate(flags.prior, made.prompts, drawing, folder, report)
+    if reason is not None:
+        report(f"no pictures: {reason}")
+        return made
+    report(f"{folder / PAGE}: {len(pictures)} pictures; a review accepts or rejects them")
+    return replace(made, images=pictures)
+
+
+def show(made: PromptSet) -> None:
+    """The prompts as a list, warnings below."""
+    from gsopt.llm_prompts.review import line
+
+    report(f"object: {made.object}, domain: {made.domain}")
+    for number, prompt in enumerate(made.prompts, 1):
+        report(line(number, len(made.prompts), prompt))
+    for warning in made.made.warnings if made.made else ():
+        report(f"warning: {warning}")
+
+
+def spent(result: Result, prices: tuple[float, float] | None) -> str:
+    """Requests, tokens, time and cost of the model."""
+    assert result.talk is not None
+    taken, given = result.talk.tokens
+    counted = [f"{taken:,} tokens in" if taken is not None else "tokens in not told"]
+    counted.append(f"{given:,} out" if given is not None else "out not told")
+    cost = "cost unknown (give --price IN,OUT)"
+    if prices is not None and taken is not None and given is not None:
+        cost = f"cost {(taken * prices[0] + given * prices[1]) / 1e6:.4f}"
+    count = len(result.talk.rounds)
+    return (
+        f"language model: {count} answer{'s' * (count != 1)}, {', '.join(counted)}, {result.talk.seconds:.1f} s, {cost}"
+    )
+
+
+def read_prices(text: str) -> tuple[float, float] | None:
+    """IN,OUT as two numbers; None for nothing."""
+    if not text:
+        return None
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"`--price` must be two numbers, got {text[:60]!r}. Try 0.15,0.6.") from error
+    if not (0 <= first < 1e9 and 0 <= second < 1e9):
+        raise UsageError(f"`--price` must not be negative, got {text[:60]!r}. Try 0.15,0.6.")
+    return first, second
