@@ -26,7 +26,7 @@ demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
 
 test: lint
-	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadgroup
 	$(MAKE) sanitize
 
 # Rewrites docs/performance.md and what it quotes; an hour. Alone on the machine the wall times mean something.
@@ -43,16 +43,18 @@ bench: $(VENV)/.for-test
 stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
-# The tests of the kernels on a build that stops at the first bad address or undefined behavior. -S and -P: neither the
-# editable install nor the sources are to be imported instead of it; --capture=sys: what a sanitizer says is to be seen.
+# The tests that run kernels, on a build that stops at the first bad address or undefined behavior. -O1 halves the time to
+# compile; tests of the reference alone have no kernel to check. -S and -P: neither the editable install nor the sources are
+# imported instead of the build; --capture=sys leaves a sanitizer's report visible.
+KERNEL_TESTS := $(filter-out tests/raster/test_reference%,$(wildcard tests/raster/test_*.py)) tests/init/stereo/test_matching.py
 sanitize: $(VENV)/.for-test
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
-	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" .
+	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" -C cmake.define.GSOPT_OPTIMIZE=-O1 .
 	export LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so):$$($(CXX) -print-file-name=libubsan.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 OMP_NUM_THREADS=1 \
 	  PYTHONPATH="build/sanitized:$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"; \
 	$(PY) -S -P -c 'import gsopt.raster._cpu as c; assert "sanitized" in c.__file__, c.__file__' && \
-	$(PY) -S -P -m pytest --capture=sys tests/raster tests/init/stereo/test_matching.py
+	$(PY) -S -P -m pytest -n 2 --capture=sys -k 'not [reference' $(KERNEL_TESTS)
 
 # A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 8 GB of memory.
 test-sd21: $(VENV)/.for-test

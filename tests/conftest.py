@@ -15,6 +15,15 @@ def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str)
     return argname if isinstance(val, bytes) else None
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that share a fixture of their module go to one worker (`--dist loadgroup`): it is built once, not twice."""
+    for item in items:
+        known = item._fixtureinfo.name2fixturedefs if isinstance(item, pytest.Function) else {}
+        if any(found.scope == "module" for defs in known.values() for found in defs[-1:]):
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_prior_at_hand() -> Iterator[None]:
     """Runs are not guided unless a test says so: most tests are about something else, and the embedded prior takes

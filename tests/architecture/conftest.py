@@ -1,4 +1,4 @@
-"""What the architecture tests look at: the files git tracks, and a clean interpreter."""
+"""Fixtures of the architecture tests: the files git tracks, and a clean interpreter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def tracked(root: Path) -> list[Path]:
 
 
 class CleanPython:
-    """Runs code in an interpreter of its own and tells which modules it loaded."""
+    """Runs code in an interpreter of its own and returns the modules it loaded."""
 
     def loaded_after(self, code: str) -> set[str]:
         """Top-level names in sys.modules after `code`; whatever `code` itself prints is dropped."""

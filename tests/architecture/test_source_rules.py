@@ -44,7 +44,7 @@ def long_functions(tree: ast.Module) -> Iterator[str]:
 
 
 def banned(tree: ast.Module) -> Iterator[str]:
-    """What runs code out of data, or hides a value that is not finite."""
+    """Calls and imports that run code out of data or hide a value that is not finite."""
     for node in ast.walk(tree):
         match node:
             case ast.Import(names=names):
@@ -62,7 +62,7 @@ def banned(tree: ast.Module) -> Iterator[str]:
 
 
 def message(call: ast.Call) -> str | None:
-    """The text of an error with its values as `{}`; None when it is not written at the place of raising."""
+    """The text of an error with its values as `{}`, or None for a text built elsewhere."""
     if not call.args:
         return ""
     match call.args[0]:

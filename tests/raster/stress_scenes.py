@@ -125,7 +125,7 @@ def far_survey() -> Case:
     return survey(ORIGIN)
 
 
-def recentred_survey() -> Case:
+def recentered_survey() -> Case:
     """As `load_scene` hands it on: the cameras' middle was subtracted from every position."""
     return survey(torch.zeros(3, dtype=torch.float64))
 

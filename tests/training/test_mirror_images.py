@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,6 +49,13 @@ def one_sided(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def config_of(dataset: Path, **changes: object) -> TrainConfig:
     config = tiny_config(dataset, iterations=150, checkpoint_every=50, preview_every=70, init=InitConfig("hull", 1500))
     return replace(config, sparse=SparseConfig(steps_per_view=0), **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def short_run(one_sided: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("short") / "run"
+    train(config_of(one_sided, iterations=2), run)
+    return run
 
 
 def started(run: Path) -> dict:
@@ -99,9 +107,8 @@ def test_a_resumed_run_keeps_its_mirrors_and_its_bits(one_sided: Path, tmp_path:
         "x",
     ],
 )
-def test_garbled_mirrors_are_refused(garbled: object, one_sided: Path, tmp_path: Path) -> None:
-    config, run = config_of(one_sided, iterations=2), tmp_path / "run"
-    train(config, run)
+def test_garbled_mirrors_are_refused(garbled: object, one_sided: Path, short_run: Path, tmp_path: Path) -> None:
+    config, run = config_of(one_sided, iterations=2), shutil.copytree(short_run, tmp_path / "run")
     document = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps({**document, "symmetry": garbled}))
     with pytest.raises(InputError, match="symmetry"):
