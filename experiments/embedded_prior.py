@@ -1,4 +1,4 @@
-"""How long does the embedded prior take to load, and for one prediction?
+"""Measures the time of the embedded prior to load, and for one prediction.
 
     python experiments/embedded_prior.py [--threads 2]
 

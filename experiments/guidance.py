@@ -1,4 +1,4 @@
-"""What does guidance change on objects that no prior was trained on? Runs with and without it, held-out metrics.
+"""Measures the effect of guidance on objects that no prior was trained on: runs with and without it, held-out metrics.
 
     python experiments/guidance.py SCENES... [-o FILE.json] [--arm off default ...] [--views 4 6 8] [--seeds 3]
                                   [--prior PRIOR] [--iterations 2000] [--draw]
@@ -40,7 +40,7 @@ NAMES = {
     "default": "default",
     "recon": "recon, the policy that is taken by itself",
     "sds": "SDS that sees the input views",
-    "sds, words": "SDS that is told the object's name, no views",
+    "sds, words": "SDS that sees the object's name, no views",
 }
 METRICS = ("psnr", "ssim", "lpips_alex")
 PAGE = Path(__file__).parents[1] / "docs" / "howto" / "guidance.md"

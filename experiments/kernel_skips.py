@@ -1,4 +1,4 @@
-"""How much time do the kernels' own skips save on the state of a real run? Checks that they change no bit.
+"""Measures the time that the kernels' own skips save on the state of a real run, and checks that they change no bit.
 
     python experiments/kernel_skips.py RUN [RUN ...]
 

@@ -1,4 +1,4 @@
-"""How good must a prior be for guidance to help? An emulated prior predicts a share of the truth.
+"""Measures the gain by guidance over the quality of the prior: an emulated prior predicts a share of the truth.
 
     python experiments/prior_strength.py SCENES... [--arm ...] [--views 4] [--seeds 1] [--json FILE.json] [--draw]
 

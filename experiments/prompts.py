@@ -1,4 +1,4 @@
-"""What do prompts change? The same guided run without prompts and with those of a user, a template, a language model.
+"""Measures the effect of prompts: one guided run without them and with those of a user, a template, a language model.
 
     python experiments/prompts.py SCENES... [-o experiments/results/prompts.json] [--notes FILE]
                                  [--prior PRIOR] [--llm URL --model NAME] [--views 4] [--seeds 3] [--iterations 2000]
@@ -38,7 +38,7 @@ def scenes(roots: list[Path]) -> list[Path]:
 
 
 def write_arm(scene: Path, arm: str, note: dict[str, str], options: argparse.Namespace) -> Path | None:
-    """The arm's prompts.json in the folder of runs; None for an arm without prompts. Generated once per scene."""
+    """The arm's prompts.json in the folder of runs, generated once per scene, or None for an arm without prompts."""
     path: Path = options.runs / f"{scene.name}-{arm}.json"
     if arm in ("off", "none"):
         return None

@@ -1,4 +1,4 @@
-"""How much does `--refine-poses` recover? The same scene with true poses, disturbed poses, and refined poses.
+"""Measures the benefit of `--refine-poses`: one scene with true poses, disturbed poses, and refined poses.
 
 python experiments/refine_poses.py --data DATA/nerf_synthetic_lego_400 --work WORK writes
 experiments/results/refine_poses.json. Every input camera is rotated by --degrees about a random axis through itself and

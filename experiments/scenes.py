@@ -1,4 +1,4 @@
-"""Which quality, time and memory does training reach on the scenes that README.md and docs/performance.md quote?
+"""Measures quality, time and memory of training on the scenes that README.md and docs/performance.md quote.
 
     python experiments/scenes.py --root DATA [--case lego-100 ...] [--runs FOLDER]
 

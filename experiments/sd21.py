@@ -1,4 +1,4 @@
-"""How much GPU memory does a guided step with Stable Diffusion 2.1 need? Writes the table of docs/howto/guidance.md.
+"""Counts the GPU memory of a guided step with Stable Diffusion 2.1 and writes the table of docs/howto/guidance.md.
 
     python experiments/sd21.py
 

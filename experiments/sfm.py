@@ -1,4 +1,4 @@
-"""How accurate are the poses of `gsopt sfm`? Each mapper on one database with known poses, and training on them.
+"""Measures the accuracy of `gsopt sfm`: each mapper on one database with known poses, and training on the result.
 
 python experiments/sfm.py --photos DATA/fox --work WORK [--video] [--train] writes its results/sfm.json. DATA/fox
 has photos and transforms.json; its poses are the truth, hidden from `gsopt sfm`. --video first encodes the

@@ -1,4 +1,4 @@
-"""What does each skip save and cost at 7000 steps? Writes the table of docs/performance.md.
+"""Measures the time and quality that each skip costs at 7000 steps, and writes the table of docs/performance.md.
 
     python experiments/skips.py --root DATA [--arm lego-plain ...] [--runs FOLDER] [--draw]
 

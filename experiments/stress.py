@@ -1,4 +1,4 @@
-"""How accurate are the kernels on adversarial scenes? Writes the table of docs/performance.md.
+"""Measures the accuracy of the kernels on adversarial scenes and writes the table of docs/performance.md.
 
     python experiments/stress.py
 

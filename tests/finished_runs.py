@@ -1,4 +1,4 @@
-"""Tiny finished runs: a dataset drawn from known splats, and a run directory that holds these very splats."""
+"""Tiny finished runs: a dataset rendered from known splats, and a run directory with these splats."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def ring(count: int, phase: float = 0.0) -> Cameras:
 
 
 def write_split(folder: Path, name: str, cameras: Cameras, gaussians: Gaussians) -> None:
-    """transforms_NAME.json of NeRF-synthetic and its pictures, drawn on white."""
+    """transforms_NAME.json of NeRF-synthetic and its images, rendered on white."""
     (folder / name).mkdir(parents=True)
     frames = []
     for index in range(len(cameras)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -34,14 +33,6 @@ TIE_MARGIN = 1e-4
 out: float32 may decide differently there, whatever the quality of its arithmetic."""
 
 
-@dataclass(frozen=True)
-class Rendering:
-    """A render, and the gradients of a fixed weighted sum of its values."""
-
-    colors: Tensor
-    gradients: Gradients
-
-
 def accuracy(count: int = GAUSSIAN_COUNT, side: int = IMAGE_SIDE, repetitions: int = 3) -> dict[str, Any]:
     """Time of forward + backward and error of every backend (`schema.ACCURACY`), the float64 reference first."""
     gaussians, camera = surface_scene(count, side, side)
@@ -49,16 +40,16 @@ def accuracy(count: int = GAUSSIAN_COUNT, side: int = IMAGE_SIDE, repetitions: i
     decided = decided_pixels(exact, camera)
     weights = torch.randn(side, side, 3, generator=torch.Generator().manual_seed(2)) * decided[..., None]
     reference = make_backend("reference")
-    truth = rendered(reference, exact, camera, weights)
+    truth, true_gradients = rendered(reference, exact, camera, weights)
 
     def row(name: str, backend: Backend, model: Gaussians, times: int) -> dict[str, Any]:
-        got = rendered(backend, model, camera, weights)
+        colors, gradients = rendered(backend, model, camera, weights)
         readings = repeat(lambda: rendered(backend, model, camera, weights), times, warm_up=1)
         return {
             "backend": name,
             "ms": spread([reading.cpu for reading in readings]),
-            "image_max_error": float((got.colors - truth.colors)[decided].abs().max()),
-            "gradient_error": max(relative_error(got.gradients, truth.gradients, name) for name in PARAMETERS),
+            "image_max_error": float((colors - truth)[decided].abs().max()),
+            "gradient_error": max(relative_error(gradients, true_gradients, name) for name in PARAMETERS),
         }
 
     rows = [row("reference64", reference, exact, repetitions), row("reference32", reference, gaussians, repetitions)]
@@ -109,9 +100,10 @@ def instruction_set(isa: str) -> Iterator[None]:
             os.environ[ISA_VARIABLE] = before
 
 
-def rendered(backend: Backend, gaussians: Gaussians, camera: Cameras, weights: Tensor) -> Rendering:
+def rendered(backend: Backend, gaussians: Gaussians, camera: Cameras, weights: Tensor) -> tuple[Tensor, Gradients]:
+    """A render, and the gradients of a fixed weighted sum of its values."""
     frame = backend.forward(gaussians, camera, RasterSettings())
-    return Rendering(frame.colors, backend.backward(frame, weights.to(frame.colors)))
+    return frame.colors, backend.backward(frame, weights.to(frame.colors))
 
 
 def relative_error(got: Gradients, truth: Gradients, name: str) -> float:

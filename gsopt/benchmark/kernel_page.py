@@ -80,10 +80,10 @@ def growth_parts(result: dict[str, Any]) -> list[str]:
         for series in result["growth"]
     ]
     names = {"Gaussians": "growth-gaussians", "pixels": "growth-pixels"}
-    pictures = [
+    image_links = [
         f"![Time and memory over {series['what']}](img/{names[series['what']]}.svg)" for series in result["growth"]
     ]
-    return [" ".join(lines), "\n".join(pictures)] if lines else []
+    return [" ".join(lines), "\n".join(image_links)] if lines else []
 
 
 def growth_chart(result: dict[str, Any], what: str) -> str:

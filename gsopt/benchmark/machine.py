@@ -36,7 +36,7 @@ def cpu_name() -> str:
 
 
 def commit() -> str | None:
-    """Commit of the sources, with + when files differ from it; None for an installed package."""
+    """Commit of the sources, with + when files differ from it, or None for an installed package."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -66,7 +66,7 @@ def calibration() -> dict[str, dict[str, float]]:
 
 
 def resident_mb() -> float | None:
-    """Resident memory of this process, MB (10^6 bytes); None where the system does not report it."""
+    """Resident memory of this process, MB (10^6 bytes), or None where the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except (OSError, ValueError, IndexError):

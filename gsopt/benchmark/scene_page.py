@@ -67,13 +67,13 @@ def page_parts(result: dict[str, Any]) -> list[str]:
     for scene in scenes(result):
         if curves := runs_of(result, scene, "curve"):
             names = [f"presets-{scene}-{word.lower()}" for word, _ in METRICS.values()]
-            parts += [preset_table(scene, curves), pictures(names)]
+            parts += [preset_table(scene, curves), image_links(names)]
         if grid := runs_of(result, scene, "grid"):
-            parts += [front_table(scene, grid), pictures([f"pareto-{scene}"])]
+            parts += [front_table(scene, grid), image_links([f"pareto-{scene}"])]
     return parts
 
 
-def pictures(names: list[str]) -> str:
+def image_links(names: list[str]) -> str:
     return "\n".join(f"![{name.replace('-', ' ')}](img/{name}.svg)" for name in names)
 
 

@@ -14,13 +14,13 @@ import torch
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.presets import with_preset
 from gsopt.config.train import DataConfig, DensityConfig, TrainConfig
+from gsopt.data.scene import View
 from gsopt.errors import UsageError
+from gsopt.events import read_events
 from gsopt.formats import load_splats
-from gsopt.gaussians import Gaussians
-from gsopt.raster.api import make_backend
-from gsopt.raster.backend import RasterSettings
-from gsopt.results.evaluation import evaluate_views
-from gsopt.training.loop import TrainResult, train
+from gsopt.results.evaluation import evaluate_views, evenly_spread
+from gsopt.results.finished_run import FinishedRun, open_run
+from gsopt.training.loop import train
 
 EVALUATIONS = 8
 """Evaluations during the run of a preset."""
@@ -66,16 +66,13 @@ class Task:
 
 def measure(task: Task) -> dict[str, Any]:
     """Trains and evaluates (`schema.RUN`); CPU time counts the steps alone, without reading and evaluation."""
-    events: list[Event] = []
     with tempfile.TemporaryDirectory() as folder:
-        result = train(task.config(), Path(folder) / "run", on_progress=events.append)
-        evaluator = Evaluator(task, result)
-        points = [
-            evaluator.point(load_splats(result.run / event["path"]), event["step"], *time_at(event["step"], events))
-            for event in events
-            if event["kind"] == "preview" and event["step"] < result.steps
-        ]
-    points.append(evaluator.point(result.gaussians, result.steps, result.cpu_seconds, result.train_seconds))
+        result = train(task.config(), Path(folder) / "run")
+        if not result.scene.test:
+            raise UsageError(f"{task.data.path} holds out no views, so nothing can be evaluated. Add --eval.")
+        views = evenly_spread(result.scene.test, MAX_EVALUATED_VIEWS)
+        points = quality_over_time(open_run(result.run), views, read_events(result.run / "events.jsonl")[0])
+    points[-1] |= {"cpu_seconds": round(result.cpu_seconds, 3), "wall_seconds": round(result.train_seconds, 3)}
     return {
         "scene": task.scene,
         "kind": task.kind,
@@ -86,26 +83,20 @@ def measure(task: Task) -> dict[str, Any]:
     }
 
 
-class Evaluator:
-    """Renders the held-out views of one run's scene and compares them with the truth."""
-
-    def __init__(self, task: Task, result: TrainResult) -> None:
-        views = result.scene.test
-        if not views:
-            raise UsageError(f"{task.data.path} holds out no views, so nothing can be evaluated. Add --eval.")
-        count = min(MAX_EVALUATED_VIEWS, len(views))
-        self._views = [views[i * len(views) // count] for i in range(count)]
-        self._backend = make_backend("auto", 1)
-        self._background = torch.tensor(task.data.evaluation_background)
-
-    @torch.no_grad()
-    def point(self, gaussians: Gaussians, step: int, cpu: float, wall: float) -> dict[str, Any]:
-        """One point of a curve (`schema.QUALITY`)."""
-        settings = RasterSettings()
-        found = evaluate_views(gaussians, self._views, self._backend, settings, self._background, None, vgg=False)
-        mean = {name: found["mean"][name] for name in ("psnr", "ssim", "lpips_alex")}
+@torch.no_grad()
+def quality_over_time(run: FinishedRun, views: Sequence[View], events: Sequence[Event]) -> list[dict[str, Any]]:
+    """Held-out quality (`schema.QUALITY`) at every preview and at the end of a run."""
+    last = int(events[-1]["step"])
+    files = {event["step"]: event["path"] for event in events if event["kind"] == "preview" and event["step"] < last}
+    points = []
+    for step, name in {**files, last: "splat.ply"}.items():
+        gaussians = load_splats(run.path / name)
+        found = evaluate_views(gaussians, views, run.backend, run.settings, run.background, None, vgg=False)["mean"]
+        mean = {name: found[name] for name in ("psnr", "ssim", "lpips_alex")}
+        cpu, wall = time_at(step, events)
         times = {"cpu_seconds": round(cpu, 3), "wall_seconds": round(wall, 3)}
-        return {"step": step, **times, "gaussians": len(gaussians), **mean}
+        points.append({"step": step, **times, "gaussians": len(gaussians), **mean})
+    return points
 
 
 def time_at(step: int, events: Sequence[Event]) -> tuple[float, float]:

@@ -248,7 +248,7 @@ def suite(flags: Suite) -> int:
     command = suite_command(flags)
     failed = run_suite(output, whole, command, cases, options, lambda text: print(text, flush=True))
     drawn = output.with_suffix(".html")
-    write_html(result_file.read(output), result_file.read_pictures(output), drawn)
+    write_html(result_file.read(output), result_file.read_images(output), drawn)
     print(f"Written: {output}, {drawn}")
     return InputError.exit_code if failed else 0
 
@@ -281,10 +281,10 @@ def draw_suite(flags: Draw) -> None:
     """The block of the suite in the page, its charts and the grid of pictures beside it, and the page of its own."""
     from gsopt.benchmark.suite import html_page, result_file, tables
 
-    document, pictures = result_file.read(flags.json), result_file.read_pictures(flags.json)
+    document, images = result_file.read(flags.json), result_file.read_images(flags.json)
     tables.write_page(document, flags.page)
-    html_page.write_grid(document, pictures, flags.page.parent / "img" / f"suite-{document['suite']}.jpg")
-    html_page.write_html(document, pictures, flags.page.with_name(f"{flags.page.stem}-{document['suite']}.html"))
+    html_page.write_grid(document, images, flags.page.parent / "img" / f"suite-{document['suite']}.jpg")
+    html_page.write_html(document, images, flags.page.with_name(f"{flags.page.stem}-{document['suite']}.html"))
 
 
 def read_threads(text: str) -> list[int]:

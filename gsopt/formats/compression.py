@@ -50,7 +50,7 @@ class GzipStream:
         """Reads to the end, where zlib compares the checksum; InputError when it differs or more data follows."""
         while not self._zlib.eof:
             if self._step(1):
-                raise InputError(f"{self._path} holds more than its header says. Export it again.")
+                raise InputError(f"{self._path} holds more than its header declares. Export it again.")
 
     def _step(self, limit: int) -> bytes:
         self._pending = self._pending or self._file.read(_PIECE)

@@ -101,7 +101,7 @@ def _check_placement(document: Document, mesh: int) -> None:
             pending += parents.get(i, [])
             moved = [key for key, value in _IDENTITY.items() if nodes[i].get(key, value) != value]
             if moved:
-                document.fail(f"node {i} has a {moved[0]}, which is not applied. Apply it where the file was made")
+                document.fail(f"node {i} has a {moved[0]}, which is not applied. Apply it where the file was exported")
 
 
 def _accessor(document: Document, attributes: Mapping[str, Any], name: str) -> Accessor:

@@ -68,7 +68,7 @@ def raw_blocks(file: BinaryIO, header: Header, element: Element, path: Path) -> 
 def _read(file: BinaryIO, dtype: np.dtype, rows: int, path: Path) -> NDArray[np.void]:
     data = file.read(rows * dtype.itemsize)
     if len(data) != rows * dtype.itemsize:
-        raise InputError(f"{path} shrank while it was read. Wait until nobody writes to it, then try again.")
+        raise InputError(f"{path} shrank during reading. Wait until no program writes to it, then try again.")
     return np.frombuffer(data, dtype)
 
 

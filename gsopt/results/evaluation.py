@@ -54,10 +54,10 @@ def evaluate_views(
     networks = _networks(vgg)
     per_view: list[dict[str, Any]] = []
     for index, view in enumerate(views):
-        picture = draw(gaussians, view.camera, backend, settings, background)
-        row: dict[str, Any] = {"name": view.name, **_image_metrics(picture, truth(view, background), networks)}
+        render = draw(gaussians, view.camera, backend, settings, background)
+        row: dict[str, Any] = {"name": view.name, **_image_metrics(render, truth(view, background), networks)}
         if save_dir is not None:
-            (path,) = save_stills(save_dir, [(safe_name(index, view.name), picture)], overwrite=True)
+            (path,) = save_stills(save_dir, [(safe_name(index, view.name), render)], overwrite=True)
             row["render"] = path.name
         per_view.append(row)
         if on_view is not None:
@@ -71,18 +71,18 @@ def _networks(vgg: bool) -> dict[str, Lpips | None]:
 
 
 def _image_metrics(
-    picture: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], networks: dict[str, Lpips | None]
+    render: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], networks: dict[str, Lpips | None]
 ) -> dict[str, float | None]:
-    a, b = (image[None].float() / 255 for image in (picture, target))
+    a, b = (image[None].float() / 255 for image in (render, target))
     values: dict[str, float | None] = {"psnr": capped_psnr(a, b).item(), "ssim": ssim(a, b).item()}
     for name, network in networks.items():
-        usable = network is not None and network.fits(*picture.shape[:2])
+        usable = network is not None and network.fits(*render.shape[:2])
         values[name] = network(a, b).item() if network is not None and usable else None
     return {name: None if value is None else round(value, METRIC_DIGITS) for name, value in values.items()}
 
 
 def _mean(per_view: list[dict[str, Any]]) -> dict[str, float | None] | None:
-    """Mean of each metric over views, None for a metric that some view lacks; None without views."""
+    """Mean of each metric over views (None when some view lacks it), or None without views."""
     if not per_view:
         return None
     columns = {key: [row[key] for row in per_view] for key in ("psnr", "ssim", "lpips_alex", "lpips_vgg")}
@@ -133,7 +133,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 
 def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | None) -> dict[str, Any]:
-    split, views = ("test", scene.test) if scene.test else ("train", _spread(scene.train, MAX_TRAIN_VIEWS))
+    split, views = ("test", scene.test) if scene.test else ("train", evenly_spread(scene.train, MAX_TRAIN_VIEWS))
     evaluated = evaluate_views(
         finished.gaussians,
         views,
@@ -152,7 +152,7 @@ def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | N
     return {"mean": None, "per_view": [], "reason": NO_TEST_VIEWS, "train": evaluated, "notes": notes}
 
 
-def _spread(views: Sequence[View], count: int) -> list[View]:
+def evenly_spread(views: Sequence[View], count: int) -> list[View]:
     """At most `count` of the views, evenly spread over their order."""
     count = min(count, len(views))
     return [views[i * len(views) // count] for i in range(count)]

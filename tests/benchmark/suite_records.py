@@ -1,4 +1,4 @@
-"""Records of runs that nobody made, for tests of what is done with them."""
+"""Invented records of runs, for tests of statistics and pages."""
 
 from __future__ import annotations
 

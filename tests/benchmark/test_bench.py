@@ -1,4 +1,4 @@
-"""`gsopt bench`: the scenes are what they claim, the figures add up, and only whole results reach the disk."""
+"""`gsopt bench`: the test scenes, the sums of the figures, and whole-or-nothing result files."""
 
 from __future__ import annotations
 

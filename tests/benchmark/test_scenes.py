@@ -1,4 +1,4 @@
-"""`gsopt bench scenes`: whole runs are judged on their way, and what no other run beats is found."""
+"""`gsopt bench scenes`: whole runs are evaluated several times, and their Pareto front is found."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsopt.training.schedule import shortened
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A preset of four steps and a grid of two runs of the scene that ships with gsopt, judged by two views."""
+    """A preset of four steps and a grid of two runs of the scene that ships with gsopt, evaluated on two views."""
     file = tmp_path_factory.mktemp("scenes") / "runs.json"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "draft", {"iterations": 4})
@@ -32,7 +32,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_a_preset_is_judged_on_its_way_and_the_grid_at_its_end(measured: Path) -> None:
+def test_a_preset_is_evaluated_during_its_run_and_the_grid_at_its_end(measured: Path) -> None:
     runs = result_files.read(measured, schema.SCENES)["runs"]
     assert [(run["kind"], run["max_gaussians"], [p["step"] for p in run["points"]]) for run in runs] == [
         ("curve", None, [2, 4]),

@@ -218,7 +218,7 @@ def test_a_mean_course_leaves_out_looks_that_some_run_lacks() -> None:
 
 
 def test_a_run_replaces_its_older_record_and_an_entry_among_the_skipped() -> None:
-    named = {name: record("ours", 20)[name] for name in result_file.ID}
+    named = {name: record("ours", 20)[name] for name in result_file.CASE}
     made = result_file.with_skip(document(record("3dgs", 19)), {**named, "reason": "no prior"})
     assert [skip["arm"] for skip in made["skipped"]] == ["ours"]
     made = result_file.with_run(made, record("ours", 21), {**MACHINE, "cpu": "other"}, "protocol; background white")
@@ -324,7 +324,7 @@ def test_rows_of_scenes_are_of_the_seeds_that_all_arms_have(tmp_path: Path) -> N
 
 
 def test_a_page_says_why_an_arm_was_left_out_and_that_versions_differ(tmp_path: Path) -> None:
-    named = {name: record("ours-user", 20)[name] for name in result_file.ID}
+    named = {name: record("ours-user", 20)[name] for name in result_file.CASE}
     made = result_file.with_skip(
         document(record("3dgs", 20), {**record("ours", 20), "code": "d"}), {**named, "reason": "r!"}
     )
@@ -346,8 +346,8 @@ def test_the_page_of_pictures_loads_nothing_and_repeats_no_markup() -> None:
 @pytest.mark.parametrize("file", COMMITTED, ids=lambda path: path.stem)
 def test_the_committed_results_keep_the_schema_and_name_no_folder(file: Path) -> None:
     if file.stem.endswith("-pictures"):
-        pictures = json.loads(file.read_text())
-        assert all(html_page.decoded(value["error"]).size for value in pictures.values() if "error" in value)
+        images = json.loads(file.read_text())
+        assert all(html_page.decoded(value["error"]).size for value in images.values() if "error" in value)
         return
     made = result_file.read(file)
     assert tables.group_sections(made)

@@ -1,4 +1,4 @@
-"""The runs of `gsopt bench --suite`: made once, resumed after a kill, the same again; smoke trains for real."""
+"""The runs of `gsopt bench --suite`: executed once, resumed after a kill, reproducible; smoke trains for real."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DIFFERENT = ("setup_cpu_seconds", "train_cpu_seconds", "peak_memory_mb", "load",
 
 
 class Killed(BaseException):
-    """Stands for a signal that nobody catches."""
+    """A signal that no code catches."""
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def context(tmp_path: Path) -> SuiteContext:
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Ids of the runs made, in order: training is replaced by a record with the case's name in it."""
+    """Ids of the executed runs, in order: a record with the case's name replaces training."""
     ids: list[str] = []
 
     def measure(case: definition.Case, context: SuiteContext) -> tuple[dict[str, Any], str, dict[str, Any]]:
@@ -78,7 +78,7 @@ def test_nothing_is_made_twice(tmp_path: Path, context: SuiteContext, made: list
     assert (tmp_path / "r.json").read_bytes() == before
     go(tmp_path, context)
     assert made == [case.id for case in CASES]
-    assert set(result_file.read_pictures(tmp_path / "r.json")) == set(made)
+    assert set(result_file.read_images(tmp_path / "r.json")) == set(made)
 
 
 @pytest.mark.parametrize("what", ["settings", "data", "code"])
@@ -99,13 +99,13 @@ def test_what_changed_is_made_again_and_replaces_its_record(
     assert len(result_file.read(tmp_path / "r.json")["runs"]) == 4
 
 
-@pytest.mark.parametrize("stage", ["measure", "write", "write_pictures", "replace"])
+@pytest.mark.parametrize("stage", ["measure", "write", "write_images", "replace"])
 @pytest.mark.parametrize("number", [0, 2])
 def test_a_kill_loses_at_most_the_run_being_made(
     tmp_path: Path, context: SuiteContext, made: list[str], stage: str, number: int
 ) -> None:
     """Killed in a run, before or while its record is written, before its pictures are."""
-    owner: Any = {"measure": single_run, "write": result_file, "write_pictures": result_file, "replace": None}[stage]
+    owner: Any = {"measure": single_run, "write": result_file, "write_images": result_file, "replace": None}[stage]
     with pytest.MonkeyPatch.context() as patch:
         if owner is None:
             patch.setattr("os.replace", after(number * 2, shutil.move))  # pictures, then the record
@@ -170,7 +170,7 @@ def test_training_that_fails_says_why(tmp_path: Path, context: SuiteContext) -> 
         single_run.call(["train", "x", "-m", str(tmp_path / "run"), "--iterations", "0"], tmp_path / "log")
 
 
-# What is looked at beside metrics.json
+# Figures beside metrics.json
 
 
 def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the_notes(
@@ -240,7 +240,7 @@ def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_smoke_trains_judges_and_draws(smoke: Path) -> None:
+def test_smoke_trains_evaluates_and_draws(smoke: Path) -> None:
     found = result_file.read(smoke)
     assert [run["arm"] for run in found["runs"]] == ["3dgs", "ours-0"]
     assert {skip["arm"] for skip in found["skipped"]} == {"ours", "ours-template"}
@@ -265,8 +265,8 @@ def test_the_same_run_gives_the_same_figures(smoke: Path, tmp_path: Path) -> Non
         {k: v for k, v in first.items() if k not in DIFFERENT}
     ] * 2
     assert [point["psnr"] for point in first["curve"]] == [point["psnr"] for point in second["curve"]]
-    pictures = [result_file.read_pictures(path) for path in (smoke, file)]
-    assert all(pictures[0][name] == value for name, value in pictures[1].items())
+    images = [result_file.read_images(path) for path in (smoke, file)]
+    assert all(images[0][name] == value for name, value in images[1].items())
 
 
 def published(folder: Path, count: int) -> Path:

@@ -1,4 +1,4 @@
-"""Splats to write and read, and how two records of them are compared."""
+"""Splats to write and read, and comparisons of two of them."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Errors:
     sh1: float
     sh_rest: float
     quats: float
-    """Of unit quaternions, up to their sign."""
+    """Largest difference of unit quaternions, up to their sign."""
 
 
 def errors(a: Gaussians, b: Gaussians) -> Errors:
-    """How far `b` is from `a`; records of different length cannot be compared."""
+    """Difference of `b` from `a` per quantity; records of different length cannot be compared."""
 
     def largest(x: Tensor) -> float:
         return float(x.abs().max()) if x.numel() else 0.0

@@ -1,4 +1,4 @@
-"""What a quantized format loses stays inside the bounds that its writer's docstring states."""
+"""The loss of a quantized format stays inside the bounds that its writer's docstring states."""
 
 from __future__ import annotations
 

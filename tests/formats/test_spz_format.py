@@ -104,7 +104,7 @@ def test_without_zstandard_the_error_has_the_pip_line(tmp_path: Path, monkeypatc
         (HEADER.pack(b"NGSP", 3, 1, 0, 24, 0, 0), "fraction bits"),
         (HEADER.pack(b"NGSP", 3, 1, 0, 12, 2, 0), "extensions"),
         (HEADER.pack(b"NGSP", 3, 2, 0, 12, 0, 0), "before its last splat"),
-        (HEADER.pack(b"NGSP", 3, 0, 0, 12, 0, 0), "more than its header says"),
+        (HEADER.pack(b"NGSP", 3, 0, 0, 12, 0, 0), "more than its header declares"),
         (HEADER.pack(b"NGSP", 3, 200_000_000, 3, 12, 0, 0), "times its size"),
         (HEADER.pack(b"NGSP", 3, 2**32 - 1, 3, 12, 0, 0), "claims"),
     ],

@@ -49,7 +49,7 @@ def test_the_means_are_the_means_of_the_views(imperfect: Path) -> None:
 
 
 def test_figures_belong_to_the_pictures_that_were_saved(imperfect: Path) -> None:
-    """Whoever computes PSNR from the PNG files gets the reported figure."""
+    """PSNR of the PNG files equals the reported value."""
     metrics = evaluate(imperfect, vgg=False)
     row = metrics["per_view"][0]
     picture, target = (
@@ -117,7 +117,7 @@ def test_images_too_small_for_a_network_have_no_such_figure(perfect: Path) -> No
 
 
 class _Halved:
-    """A store whose pictures have half the size."""
+    """A store whose images have half the size."""
 
     def __init__(self, store) -> None:
         self._store = store

@@ -1,4 +1,4 @@
-"""The web viewer: what it follows, where it puts cameras, and that a real server starts."""
+"""The web viewer: it follows a run, places the cameras, and starts a real server."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def emit(run: Path, *events: dict[str, Any]) -> None:
 
 
 def preview(run: Path, step: int) -> dict[str, Any]:
-    """Write a preview with `step` Gaussians and give its event."""
+    """Writes a preview with `step` Gaussians and returns its event."""
     name = f"previews/step_{step:06d}.ply"
     save_splats(run / name, gaussians(step))
     return {"kind": "preview", "step": step, "path": name}
@@ -112,7 +112,7 @@ def test_a_path_that_leads_out_of_the_run_or_nowhere_is_ignored(run: Path, path:
 
 
 class Recorder:
-    """Stands in for viser: keeps what the scene was told."""
+    """A fake of viser that records the calls on its scene."""
 
     def __init__(self) -> None:
         self.server = MagicMock()

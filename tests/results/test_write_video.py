@@ -1,4 +1,4 @@
-"""Films and frames: what is written is what was drawn, and nothing is written over."""
+"""Videos and frames: files hold the renders, and no file is overwritten."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsopt.results.video import safe_name, save_stills, save_video
 
 
 def pictures(count: int, height: int = 20, width: int = 30) -> list[torch.Tensor]:
-    """Flat pictures of rising brightness."""
+    """Flat images of rising brightness."""
     return [torch.full((height, width, 3), 20 + 40 * i, dtype=torch.uint8) for i in range(count)]
 
 

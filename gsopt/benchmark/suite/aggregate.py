@@ -23,7 +23,7 @@ class Difference:
 
     mean: float
     half: float | None
-    """Half width of the confidence interval; None for a single value."""
+    """Half width of the confidence interval, or None for a single value."""
     lowest: float
     highest: float
     positive: int

@@ -26,6 +26,7 @@ GROUP |= {"flags": [str], "get": str}
 OPTIONAL: dict[str, Any] = {"why": "", "flags": [], "get": ""}
 SUITE = {"title": str, "about": str, "root": str, "groups": [GROUP]}
 PATTERNS = {
+    "root": (r"(package)?", '"package" or absent, where --root names another folder'),
     "name": (r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", "letters, digits, `-`, `_` and `.`"),
     "scenes": (r"(?!(.*/)?\.\.(/|$))[^/|\\\0][^|\\\0]*", "folders below the root"),
     "views": (r"all|[1-9][0-9]{0,5}|[0-9]{1,6}(,[0-9]{1,6})+", '"all", a number of views, or ids such as "2,16"'),
@@ -35,7 +36,7 @@ PATTERNS = {
         "flags of `gsopt train` that the suite does not set itself",
     ),
 }
-"""Values of a group: names become parts of file names, scenes and runs parts of ids."""
+"""Allowed values: names become parts of file names, scenes and runs parts of ids."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,10 @@ class Suite:
     title: str
     about: str
     root: Path | None
-    """Folder of scenes that ship with gsopt; None where the user names it."""
+    """Folder of scenes that ship with gsopt, or None where the user names it."""
     groups: tuple[Group, ...]
     declaration: str | None = None
-    """Text of a suite of one's own, which its result file repeats; None for a built-in suite."""
+    """Text of a suite of one's own, which its result file repeats, or None for a built-in suite."""
     folder: Path | None = None
     """Folder of that file, which holds its scenes when no other root is given."""
 
@@ -88,9 +89,14 @@ class Case:
     """Flags of `gsopt train`, without folders and without flags that only this machine needs."""
 
     @property
+    def fields(self) -> dict[str, Any]:
+        """Fields of the run in the result file (`result_file.CASE`)."""
+        return {name: value for name, value in vars(self).items() if name != "flags"}
+
+    @property
     def id(self) -> str:
         """Name of the run in the result file: two cases with one id are the same run."""
-        return f"{self.group}|{self.scene}|{self.views}|{self.arm}|{self.iterations}|{self.seed}"
+        return "|".join(map(str, self.fields.values()))
 
 
 def load(name: str) -> Suite:
@@ -137,9 +143,7 @@ def parse(text: str, name: str) -> Suite:
     names = [group["name"] for group in document["groups"]]
     if not names or len(set(names)) < len(names):
         raise InputError(f"`{name}.groups` must be groups with different names, got {names}. Correct the file.")
-    if document["root"] not in ("", "package"):
-        got = document["root"]
-        raise InputError(f'`{name}.root` must be "package" or absent, got {got!r}. Name a folder with --root.')
+    _match(name, "root", document["root"])
     groups = tuple(_group(values, f"{name}.{values['name'][:40]}") for values in document["groups"])
     root = PACKAGE if document["root"] else None
     return Suite(name, document["title"], document["about"].strip(), root, groups)

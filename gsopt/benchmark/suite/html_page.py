@@ -29,15 +29,15 @@ WEBP_PREFIX = "data:image/webp;base64,"
 CELL_SIDE, CELL_GAP, JPEG_QUALITY = 150, 6, 85
 
 
-def write_html(document: dict[str, Any], pictures: dict[str, Any], path: Path) -> None:
+def write_html(document: dict[str, Any], images: dict[str, Any], path: Path) -> None:
     """Write the page."""
-    write_atomic(path, page(document, pictures).encode())
+    write_atomic(path, page(document, images).encode())
 
 
-def page(document: dict[str, Any], pictures: dict[str, Any]) -> str:
+def page(document: dict[str, Any], images: dict[str, Any]) -> str:
     suite = declared.of_document(document)
     lines = "".join(f"<p>{marked(line)}</p>" for line in about(document))
-    sections = "".join(section(made, pictures) for made in group_sections(document))
+    sections = "".join(section_html(section, images) for section in group_sections(document))
     rest = "".join(f"<li>{marked(line)}</li>" for line in missing(document))
     return html_document(
         f"{suite.title} · gsopt bench",
@@ -54,24 +54,24 @@ def marked(text: str) -> str:
     return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
 
 
-def section(made: GroupSection, pictures: dict[str, Any]) -> str:
+def section_html(section: GroupSection, images: dict[str, Any]) -> str:
     """A group's tables, charts and renders."""
-    out = [f"<section><h2>{escape(made.title)}</h2><p>{marked(' '.join(made.lines))}</p>"]
-    for note, (head, rows) in made.tables:
+    out = [f"<section><h2>{escape(section.title)}</h2><p>{marked(' '.join(section.lines))}</p>"]
+    for note, (head, rows) in section.tables:
         cells = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
         body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         out.append(f"<p class='muted'>{escape(note)}</p>")
         out.append(f'<div class="scroll"><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>')
-    out.append(f'<div class="charts">{"".join(made.charts.values())}</div>')
-    return "".join(out) + grid(made, pictures) + "</section>\n"
+    out.append(f'<div class="charts">{"".join(section.charts.values())}</div>')
+    return "".join(out) + grid(section, images) + "</section>\n"
 
 
-def grid(made: GroupSection, pictures: dict[str, Any]) -> str:
+def grid(section: GroupSection, images: dict[str, Any]) -> str:
     """Rows of input, every arm with its error below, truth; empty without images."""
-    rows = "".join(grid_row(made, scene, pictures) for scene in made.scenes)
+    rows = "".join(grid_row(section, scene, images) for scene in section.scenes)
     if not rows:
         return ""
-    names = "".join(f"<th>{escape(arm)}<br>{steps:,}</th>" for arm, steps in made.variants)
+    names = "".join(f"<th>{escape(arm)}<br>{steps:,}</th>" for arm, steps in section.variants)
     note = (
         "The held-out view farthest from all input views, chosen before any result, and the input view nearest to "
         "it; below each render its error (dark: none, bright: a quarter of the range and more). Seed 0."
@@ -80,21 +80,21 @@ def grid(made: GroupSection, pictures: dict[str, Any]) -> str:
     return f"<p class='muted'>{note}</p><div class='scroll'><table class='grid'>{head}{rows}</table></div>"
 
 
-def grid_row(made: GroupSection, scene: str, pictures: dict[str, Any]) -> str:
-    shared = pictures.get(f"{scene}|{made.views}")
+def grid_row(section: GroupSection, scene: str, images: dict[str, Any]) -> str:
+    shared = images.get(f"{scene}|{section.views}")
     if not isinstance(shared, dict):
         return ""
     cells = [f"<td>{escape(scene.rpartition('/')[2])}</td>", _cell(shared, "input")]
-    for one in made.variants:
-        found = find(pictures, scene, made.views, one)
+    for one in section.variants:
+        found = find(images, scene, section.views, one)
         cells.append("<td class='none'>no run</td>" if found is None else _cell(found, "render", "error"))
     return f"<tr>{''.join(cells)}{_cell(shared, 'truth')}</tr>"
 
 
-def find(pictures: dict[str, Any], scene: str, views: str, one: Variant) -> dict[str, Any] | None:
+def find(images: dict[str, Any], scene: str, views: str, one: Variant) -> dict[str, Any] | None:
     """Images of a run of seed 0 in any group."""
     ending = f"|{scene}|{views}|{one[0]}|{one[1]}|0"
-    return next((value for key, value in pictures.items() if key.endswith(ending)), None)
+    return next((value for key, value in images.items() if key.endswith(ending)), None)
 
 
 def _cell(found: dict[str, Any], *names: str) -> str:
@@ -103,11 +103,11 @@ def _cell(found: dict[str, Any], *names: str) -> str:
     return f"<td>{shown}</td>"
 
 
-def write_grid(document: dict[str, Any], pictures: dict[str, Any], path: Path, most: int = 12) -> bool:
+def write_grid(document: dict[str, Any], images: dict[str, Any], path: Path, max_rows: int = 12) -> bool:
     """The rows of the first part that have all of input, 3dgs, ours-0, ours, truth and the error of ours, as one JPEG;
     False when there is none."""
-    for made in group_sections(document):
-        rows = [row for scene in made.scenes if (row := _pictures(made, scene, pictures))][:most]
+    for section in group_sections(document):
+        rows = [row for scene in section.scenes if (row := _row_images(section, scene, images))][:max_rows]
         if rows:
             sheet = Image.new(
                 "RGB", (len(rows[0]) * (CELL_SIDE + CELL_GAP), len(rows) * (CELL_SIDE + CELL_GAP)), "white"
@@ -125,11 +125,11 @@ def write_grid(document: dict[str, Any], pictures: dict[str, Any], path: Path, m
     return False
 
 
-def _pictures(made: GroupSection, scene: str, pictures: dict[str, Any]) -> Sequence[str]:
+def _row_images(section: GroupSection, scene: str, images: dict[str, Any]) -> Sequence[str]:
     """Data URIs of a whole row, empty when one is missing."""
-    steps = made.variants[0][1]
-    shared = pictures.get(f"{scene}|{made.views}")
-    found = [find(pictures, scene, made.views, (arm, steps)) for arm in ("3dgs", "ours-0", "ours")]
+    steps = section.variants[0][1]
+    shared = images.get(f"{scene}|{section.views}")
+    found = [find(images, scene, section.views, (arm, steps)) for arm in ("3dgs", "ours-0", "ours")]
     if not isinstance(shared, dict) or not all(isinstance(one, dict) for one in found):
         return ()
     renders = [str(one["render"]) for one in found if one is not None]

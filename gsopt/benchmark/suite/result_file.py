@@ -21,13 +21,8 @@ NUMBERS = [(float, None)]
 MACHINE = {key: kind for key, kind in schema.MACHINE.items() if key != "load"}
 CURVE_POINT = {"step": int, "cpu_seconds": float, "gaussians": int, "psnr": float, "lpips_alex": (float, None)}
 """Held-out quality at one step; seconds count reading, first Gaussians and the guard, not the interpreter's start."""
-RUN = {
-    "group": str,
-    "scene": str,
-    "views": str,
-    "arm": str,
-    "iterations": int,
-    "seed": int,
+CASE = {"group": str, "scene": str, "views": str, "arm": str, "iterations": int, "seed": int}
+RUN = CASE | {
     "key": str,
     "flags": [str],
     "views_in": int,
@@ -47,7 +42,7 @@ RUN = {
     "code": str,
     "load": (float, None),
 }
-SKIPPED = {"group": str, "scene": str, "views": str, "arm": str, "iterations": int, "seed": int, "reason": str}
+SKIPPED = CASE | {"reason": str}
 DOCUMENT = {
     "version": int,
     "suite": str,
@@ -58,12 +53,11 @@ DOCUMENT = {
     "skipped": [SKIPPED],
 }
 Document = dict[str, Any]
-ID = ("group", "scene", "views", "arm", "iterations", "seed")
 
 
 def run_id(record: dict[str, Any]) -> str:
     """Equals `definition.Case.id`."""
-    return "|".join(str(record[name]) for name in ID)
+    return "|".join(str(record[name]) for name in CASE)
 
 
 def shape(document: Document) -> schema.Schema:
@@ -146,18 +140,18 @@ def with_skip(document: Document, record: Document) -> Document:
     return {**document, "skipped": [*kept, record]}
 
 
-def pictures_path(path: Path) -> Path:
+def images_path(path: Path) -> Path:
     """Path of the images of a result file."""
     return path.with_name(f"{path.stem}-pictures.json")
 
 
-def read_pictures(path: Path) -> dict[str, Any]:
+def read_images(path: Path) -> dict[str, Any]:
     """Data URIs by case and by scene; {} when there is no file."""
-    return read_json(pictures_path(path)) if pictures_path(path).exists() else {}
+    return read_json(images_path(path)) if images_path(path).exists() else {}
 
 
-def write_pictures(path: Path, pictures: dict[str, Any]) -> None:
-    write_atomic(pictures_path(path), compact(pictures))
+def write_images(path: Path, images: dict[str, Any]) -> None:
+    write_atomic(images_path(path), compact(images))
 
 
 @contextlib.contextmanager

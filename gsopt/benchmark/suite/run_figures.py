@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.benchmark.scenes import time_at
+from gsopt.benchmark.scenes import quality_over_time
+from gsopt.benchmark.suite.result_file import CURVE_POINT
 from gsopt.data.scene import Scene, View
-from gsopt.formats import load_splats
-from gsopt.results.evaluation import METRIC_DIGITS, evaluate_views
+from gsopt.results.evaluation import METRIC_DIGITS, evenly_spread
 from gsopt.results.finished_run import FinishedRun, truth
 from gsopt.results.report.embedded_images import data_uri, error_map, shrunk
 from gsopt.results.video import as_image
@@ -29,29 +29,16 @@ MAX_DEPTH_BYTES = 1 << 28
 Event = Mapping[str, Any]
 
 
-@torch.no_grad()
 def curve(finished: FinishedRun, scene: Scene, events: Sequence[Event], setup: float) -> list[dict[str, Any]]:
     """Held-out quality at every preview and at the end (`result_file.CURVE_POINT`), over CPU seconds."""
-    count = min(CURVE_VIEWS, len(scene.test))
-    views = [scene.test[i * len(scene.test) // count] for i in range(count)]
-    steps = int(events[-1]["step"])
-    previews = [event for event in events if event["kind"] == "preview" and event["step"] < steps]
-    moments = [(event["step"], finished.path / event["path"]) for event in previews]
-    moments.append((steps, finished.path / "splat.ply"))
-    drawing = finished.backend, finished.settings, finished.background
-    points = []
-    for step, path in moments:
-        gaussians = load_splats(path)
-        mean = evaluate_views(gaussians, views, *drawing, None, vgg=False)["mean"]
-        cpu_seconds = round(setup + time_at(step, events)[0], 2)
-        quality = {"psnr": mean["psnr"], "lpips_alex": mean["lpips_alex"]}
-        points.append({"step": step, "cpu_seconds": cpu_seconds, "gaussians": len(gaussians), **quality})
-    return points
+    points = quality_over_time(finished, evenly_spread(scene.test, CURVE_VIEWS), events)
+    points = [{**point, "cpu_seconds": round(setup + point["cpu_seconds"], 2)} for point in points]
+    return [{key: point[key] for key in CURVE_POINT} for point in points]
 
 
 @torch.no_grad()
 def shape(finished: FinishedRun, scene: Scene) -> dict[str, list[float | None]]:
-    """Mask IoU and mean depth error (scene units) per held-out view; None where the truth is missing."""
+    """Mask IoU and mean depth error (scene units) per held-out view, or None where the truth is missing."""
     rows = [_shape_of(finished, scene, view) for view in scene.test]
     return {"mask_iou": [iou for iou, _ in rows], "depth_error": [depth for _, depth in rows]}
 
@@ -96,15 +83,15 @@ def read_depth(root: Path, view: View) -> Float[Tensor, "H W"] | None:
 
 
 @torch.no_grad()
-def pictures(finished: FinishedRun, scene: Scene) -> tuple[dict[str, str], dict[str, str]]:
+def images(finished: FinishedRun, scene: Scene) -> tuple[dict[str, str], dict[str, str]]:
     """(images that all runs of a scene share, images of this run), as data URIs: the held-out view that is farthest
     from all input views, a choice that depends on no result, and the input view nearest to it."""
     view, nearest = remote_view(scene)
-    target, picture = as_image(truth(view, finished.background)), as_image(finished.draw(view.camera))
+    target, render = as_image(truth(view, finished.background)), as_image(finished.draw(view.camera))
     shared = {"view": view.name, "truth": data_uri(shrunk(target, IMAGE_SIDE)), "input_view": nearest.name}
     shared["input"] = data_uri(shrunk(as_image(truth(nearest, finished.background)), IMAGE_SIDE))
-    error = error_map(picture, target)
-    return shared, {"render": data_uri(shrunk(picture, IMAGE_SIDE)), "error": data_uri(shrunk(error, IMAGE_SIDE))}
+    error = error_map(render, target)
+    return shared, {"render": data_uri(shrunk(render, IMAGE_SIDE)), "error": data_uri(shrunk(error, IMAGE_SIDE))}
 
 
 def remote_view(scene: Scene) -> tuple[View, View]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,7 @@ def _one(path: Path, document: dict[str, Any], case: Case, context: SuiteContext
     """(document after one case, written when it changed; line to print)."""
     message, old = "", next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
     if (reason := single_run.reason_to_skip(case, context)) is not None:
-        skip = {**_named(case), "reason": reason}
+        skip = {**case.fields, "reason": reason}
         if old is not None or skip in document["skipped"]:  # keep a record made on a machine that had a prior
             return document, ""
         document = result_file.with_skip(document, skip)
@@ -57,19 +56,15 @@ def _one(path: Path, document: dict[str, Any], case: Case, context: SuiteContext
         try:
             if old is not None and old["key"] == single_run.key(case, context):
                 return document, ""
-            record, protocol, pictures = single_run.measure(case, context)
+            record, protocol, images = single_run.measure(case, context)
         except RunFailed as error:
             return document, f"{case.id} failed: {error}"
         document = result_file.with_run(document, record, machine(), protocol)
-        if pictures:
-            result_file.write_pictures(path, {**result_file.read_pictures(path), **pictures})
+        if images:
+            result_file.write_images(path, {**result_file.read_images(path), **images})
         message = line(record)
     result_file.write(path, document)
     return document, message
-
-
-def _named(case: Case) -> dict[str, Any]:
-    return {name: value for name, value in asdict(case).items() if name in result_file.ID}
 
 
 def line(record: dict[str, Any]) -> str:

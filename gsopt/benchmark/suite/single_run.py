@@ -118,7 +118,7 @@ def key(case: Case, context: SuiteContext) -> str:
 
 
 def prompts(case: Case, context: SuiteContext) -> Path | None:
-    """The arm's prompts.json, generated once per scene; None for an arm without prompts."""
+    """The arm's prompts.json, generated once per scene, or None for an arm without prompts."""
     if case.arm not in arm_flags.PROMPT_SOURCES:
         return None
     note = notes(context.root)[case.scene]
@@ -201,12 +201,7 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
     per_view = {name: [row[name] for row in metrics["per_view"]] for name in METRICS[:4]}
     per_view |= run_figures.shape(finished, scene)
     record = {
-        "group": case.group,
-        "scene": case.scene,
-        "views": case.views,
-        "arm": case.arm,
-        "iterations": case.iterations,
-        "seed": case.seed,
+        **case.fields,
         "key": key(case, context),
         "flags": list(case.flags),
         "views_in": len(scene.train),
@@ -223,10 +218,10 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
         "guidance": guidance_facts(run),
         "code": run_key.code_hash(),
     }
-    pictures: dict[str, Any] = {}
+    images: dict[str, Any] = {}
     if case.seed == 0:
-        pictures[f"{case.scene}|{case.views}"], pictures[case.id] = run_figures.pictures(finished, scene)
-    return record, metrics["protocol"], pictures
+        images[f"{case.scene}|{case.views}"], images[case.id] = run_figures.images(finished, scene)
+    return record, metrics["protocol"], images
 
 
 def mean(values: list[float | None]) -> float | None:

@@ -15,6 +15,7 @@ from gsopt.benchmark.suite import aggregate, arm_flags
 from gsopt.benchmark.suite import definition as declared
 from gsopt.benchmark.suite.aggregate import Difference, Run, Variant, variant
 from gsopt.benchmark.suite.definition import Group, Suite, view_count
+from gsopt.benchmark.suite.result_file import run_id
 from gsopt.events import write_atomic
 
 METRICS = {
@@ -62,11 +63,11 @@ def group_section(suite: Suite, group: Group, views: str, runs: list[Run]) -> Gr
     variants = [one for one in group.runs if any(variant(run) == one for run in runs)]
     several = len(group.views) > 1
     title = group.title + (f": {view_count(views)} views" if several else "")
-    made = GroupSection(title, [group.why], views=views, variants=variants)
-    made.scenes = [scene for scene in group.scenes if any(run["scene"] == scene for run in runs)]
+    section = GroupSection(title, [group.why], views=views, variants=variants)
+    section.scenes = [scene for scene in group.scenes if any(run["scene"] == scene for run in runs)]
     seeds = sorted({run["seed"] for run in runs})
     which = ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
-    made.lines.append(f"{len(runs)} runs, {_count(len(made.scenes), 'scene')}, {which}.")
+    section.lines.append(f"{len(runs)} runs, {_count(len(section.scenes), 'scene')}, {which}.")
     whole = aggregate.complete(runs, variants)
     same = aggregate.common(runs, whole)
     note = "Means over scenes, seeds averaged first; " + (
@@ -74,20 +75,24 @@ def group_section(suite: Suite, group: Group, views: str, runs: list[Run]) -> Gr
     )
     if lacking := [_name(one) for one in variants if one not in whole] if same else []:
         note += f" Without {', '.join(lacking)}: scenes or seeds are missing."
-    made.tables.append((note, figures(same or runs, whole if same else variants)))
+    section.tables.append((note, figures(same or runs, whole if same else variants)))
     pairs = list(comparisons(group, variants))
     if rows := [row for a, b in pairs if (row := compared(runs, a, b))]:
-        what = "scenes" if len(made.scenes) > 1 else "seeds of the one scene"
+        what = "scenes" if len(section.scenes) > 1 else "seeds of the one scene"
         head = ["paired difference", what, *(f"Δ {METRICS[m][0]}" for m in COMPARED), "PSNR worst", "PSNR better in"]
-        made.tables.append(("Mean with its 95 % confidence interval (Student's t); losses included.", (head, rows)))
+        section.tables.append(("Mean with its 95 % confidence interval (Student's t); losses included.", (head, rows)))
     if len(variants) > 1 and (rows := [row for a in variants if (row := time_row(runs, a, variants[0]))]):
         note = f"CPU seconds until a run reaches the final PSNR of {_name(variants[0])} on the same scene (mean of "
         note += f"{max(run['curve_views'] for run in runs)} held-out views, evaluated {declared.EVALUATIONS} times)."
-        made.tables.append((note, (["arm", "median of the runs that reach it", "reach it", "whole run, median"], rows)))
-    if len(made.scenes) > 1:
-        made.tables.append(("PSNR of every scene.", scene_rows(runs, made.scenes, variants)))
-    made.charts = charts(f"suite-{suite.name}-{group.name}" + (f"-{view_count(views)}" if several else ""), made, runs)
-    return made
+        section.tables.append(
+            (note, (["arm", "median of the runs that reach it", "reach it", "whole run, median"], rows))
+        )
+    if len(section.scenes) > 1:
+        section.tables.append(("PSNR of every scene.", scene_rows(runs, section.scenes, variants)))
+    section.charts = charts(
+        f"suite-{suite.name}-{group.name}" + (f"-{view_count(views)}" if several else ""), section, runs
+    )
+    return section
 
 
 def figures(runs: Sequence[Run], variants: Sequence[Variant]) -> Table:
@@ -167,16 +172,16 @@ def scene_rows(runs: Sequence[Run], scenes: Sequence[str], variants: Sequence[Va
     return ["scene", *(_name(one) for one in variants), "guard's factor"], rows
 
 
-def charts(stem: str, made: GroupSection, runs: Sequence[Run]) -> dict[str, str]:
+def charts(stem: str, section: GroupSection, runs: Sequence[Run]) -> dict[str, str]:
     """Quality over CPU seconds of the complete arms, over the scenes and seeds that all of them have."""
-    whole = aggregate.complete(runs, made.variants)
+    whole = aggregate.complete(runs, section.variants)
     same = aggregate.common(runs, whole)
     if not same:
         return {}
     drawn = {}
     for metric, label in (("psnr", "PSNR, dB"), ("lpips_alex", "LPIPS (Alex), lower is better")):
         series = [Series(_name(v), aggregate.mean_curve([r for r in same if variant(r) == v], metric)) for v in whole]
-        title = f"{made.title} ({_count(len({run['scene'] for run in same}), 'scene')})"
+        title = f"{section.title} ({_count(len({run['scene'] for run in same}), 'scene')})"
         drawn[f"{stem}-{metric.partition('_')[0]}"] = chart(title, Axis("CPU seconds"), Axis(label), series)
     return drawn
 
@@ -200,12 +205,10 @@ def about(document: dict[str, Any]) -> list[str]:
 def missing(document: dict[str, Any]) -> list[str]:
     """Runs that the suite declares (with three seeds) and the file lacks, and skipped runs with their reasons."""
     suite = declared.of_document(document)
-    have = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["runs"]}
-    skipped = {(r["group"], r["scene"], r["views"], r["arm"], r["iterations"], r["seed"]) for r in document["skipped"]}
+    known = {run_id(record) for record in (*document["runs"], *document["skipped"])}
     lines, lacking = [], Counter[str]()
     for case in declared.cases(suite, SEEDS):
-        known = (case.group, case.scene, case.views, case.arm, case.iterations, case.seed)
-        if known not in have and known not in skipped:
+        if case.id not in known:
             begun = any(run["seed"] == case.seed for run in document["runs"])
             where = f"{case.group}, {view_count(case.views)} views, " if begun else ""
             lacking[f"{where}seed {case.seed}"] += 1
@@ -222,22 +225,17 @@ def missing(document: dict[str, Any]) -> list[str]:
 def write_page(document: dict[str, Any], page: Path) -> None:
     """Rewrites the block of the suite in a Markdown page, and the charts beside it in img/."""
     blocks = [*about(document)]
-    for made in group_sections(document):
-        blocks += [f"### {made.title}", " ".join(made.lines)]
-        for note, (head, rows) in made.tables:
+    (page.parent / "img").mkdir(exist_ok=True)
+    for section in group_sections(document):
+        blocks += [f"### {section.title}", " ".join(section.lines)]
+        for note, (head, rows) in section.tables:
             blocks += [note, table(head, rows)]
-        for name, svg in made.charts.items():
-            write_atomic(_folder(page) / f"{name}.svg", svg.encode())
-        if made.charts:
-            blocks.append("\n".join(f"![{made.title}](img/{name}.svg)" for name in made.charts))
+        for name, svg in section.charts.items():
+            write_atomic(page.parent / "img" / f"{name}.svg", svg.encode())
+        if section.charts:
+            blocks.append("\n".join(f"![{section.title}](img/{name}.svg)" for name in section.charts))
     blocks.append("\n".join(f"- {line}" for line in missing(document)))
     replace_block(page, document["suite"], "\n\n".join(blocks))
-
-
-def _folder(page: Path) -> Path:
-    folder = page.parent / "img"
-    folder.mkdir(exist_ok=True)
-    return folder
 
 
 def _name(one: Variant) -> str:

@@ -19,10 +19,10 @@ MAX_LINES = 40
 def cameras_section(dataset: Path, run: Path, messages: list[str]) -> str:
     """HTML, empty when the poses were given and kept; unreadable parts are left out and named in `messages`."""
     lines = [*_sfm_lines(dataset / "sfm.json", messages), *_refinement_lines(run / "poses.json", messages)]
-    picture = read_image(dataset / "sfm.png", IMAGE_SIDE, MAX_PIXELS)
-    if not lines and picture is None:
+    image = read_image(dataset / "sfm.png", IMAGE_SIDE, MAX_PIXELS)
+    if not lines and image is None:
         return ""
-    drawn = "" if picture is None else f'<img src="{data_uri(picture)}" style="width:100%" alt="Cameras and points">'
+    drawn = "" if image is None else f'<img src="{data_uri(image)}" style="width:100%" alt="Cameras and points">'
     return f"<section><h2>Cameras</h2>{''.join(f'<p>{escape(line)}</p>' for line in lines)}{drawn}</section>\n"
 
 

@@ -34,7 +34,7 @@ def shrunk(image: Image.Image, side: int) -> Image.Image:
 
 
 def read_image(path: Path, side: int, max_pixels: int) -> Image.Image | None:
-    """A PNG scaled down to fit into a square of `side` px; None for a file that is missing, too large or no PNG."""
+    """A PNG scaled down to fit into a square of `side` px, or None for a file that is missing, too large or no PNG."""
     if not is_regular(path):
         return None
     try:

@@ -68,34 +68,34 @@ def summary_text(summary: dict[str, Any]) -> str:
 
 def _view(folder: Path, view: int) -> Row:
     files = (f"{when}_{view:02d}{what}" for when in ("before", "after") for what in ("", "_uncertainty"))
-    return "", _pictures(folder, files)
+    return "", _images(folder, files)
 
 
 def _step(folder: Path, sample: dict[str, Any]) -> Row:
     step = _whole(sample.get("step"))
     text = str(sample.get("text") or "")[:200]
-    pictures = _pictures(folder, (f"step_{step:06d}_{kind}" for kind in PROPOSAL))
-    return f"step {step:,}" + (f": {text}" if text else ""), pictures
+    images = _images(folder, (f"step_{step:06d}_{kind}" for kind in PROPOSAL))
+    return f"step {step:,}" + (f": {text}" if text else ""), images
 
 
-def _pictures(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
+def _images(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
     return [read_image(folder / f"{name}.png", IMAGE_SIDE, MAX_PIXELS) for name in names]
 
 
 def _cards(title: str, kinds: Iterable[str], rows: list[Row]) -> str:
-    shown = [(text, pictures) for text, pictures in rows if any(pictures)]
+    shown = [(text, images) for text, images in rows if any(images)]
     if not shown:
         return ""
     cards = "".join(
         '<article class="card"><div class="strip">'
         + "".join(
-            f'<figure><img loading="lazy" src="{data_uri(picture)}" alt="{escape(kind)}">'
+            f'<figure><img loading="lazy" src="{data_uri(image)}" alt="{escape(kind)}">'
             f"<figcaption>{escape(kind.replace('_', ', '))}</figcaption></figure>"
-            for kind, picture in zip(kinds, pictures, strict=True)
-            if picture is not None
+            for kind, image in zip(kinds, images, strict=True)
+            if image is not None
         )
         + f'</div><p class="muted">{escape(text)}</p></article>'
-        for text, pictures in shown
+        for text, images in shown
     )
     return f'<h3>{escape(title)}</h3><div class="cards">{cards}</div>'
 

@@ -59,10 +59,10 @@ def header(report: Report) -> str:
 def _turntable(report: Report) -> str:
     if not report.turntable:
         return '<div class="turntable empty"><p class="muted">No turntable.</p></div>'
-    still, film = data_uri(report.turntable[0]), animation_uri(report.turntable, TURNTABLE_FPS)
+    still, animation = data_uri(report.turntable[0]), animation_uri(report.turntable, TURNTABLE_FPS)
     return (
         f'<picture class="turntable"><source media="(prefers-reduced-motion: reduce)" srcset="{still}">'
-        f'<img src="{film}" alt="Turntable of the result"></picture>'
+        f'<img src="{animation}" alt="Turntable of the result"></picture>'
     )
 
 
@@ -124,7 +124,7 @@ def views(report: Report) -> str:
 def _card(view: EvaluatedView) -> str:
     shown = (("render", view.render), ("truth", view.truth), ("error", error_map(view.render, view.truth)))
     name = escape(view.name)
-    pictures = "".join(
+    figures_html = "".join(
         f'<figure><img loading="lazy" src="{data_uri(shrunk(image, VIEW_SIDE))}" alt="{title} of {name}">'
         f"<figcaption>{title}</figcaption></figure>"
         for title, image in shown
@@ -134,7 +134,7 @@ def _card(view: EvaluatedView) -> str:
         f"{TITLES[key]} {figure(key, value)}" for key, value in view.figures.items() if value is not None
     )
     return (
-        f'<article class="card"><div class="triple">{pictures}</div>'
+        f'<article class="card"><div class="triple">{figures_html}</div>'
         f'<p><b>{name}</b> {badge}<br><span class="muted">{figures}</span></p></article>'
     )
 
@@ -159,12 +159,12 @@ def inputs(report: Report) -> str:
         return ""
     left_out = (report.input_count or 0) - len(report.inputs)
     more = f' <span class="muted">{len(report.inputs)} of {report.input_count}</span>' if left_out > 0 else ""
-    pictures = "".join(
+    figures_html = "".join(
         f'<figure><img loading="lazy" src="{data_uri(image)}" alt=""><figcaption title="{escape(name)}">{escape(name)}'
         "</figcaption></figure>"
         for name, image in report.inputs
     )
-    return f'<section><h2>Input views{more}</h2><div class="inputs">{pictures}</div></section>\n'
+    return f'<section><h2>Input views{more}</h2><div class="inputs">{figures_html}</div></section>\n'
 
 
 def progress_charts(report: Report) -> str:

@@ -27,7 +27,7 @@ class Column:
     psnrs: tuple[float, ...]
     """PSNR per left-out view, dB."""
     alignment: float | None
-    pictures: tuple[Image.Image, ...]
+    images: tuple[Image.Image, ...]
 
     @property
     def mean(self) -> float:
@@ -42,7 +42,7 @@ def comparison_page(
         f"{title} · gsopt prompts",
         f'<main>\n<header><p class="eyebrow">gsopt prompts compare</p><h1>{escape(title)}</h1>'
         f'<p class="muted">{escape(facts)}</p></header>\n'
-        f"{_table(views, columns)}{_pictures(views, truths, columns)}{_words(columns)}</main>\n"
+        f"{_table(views, columns)}{_images(views, truths, columns)}{_words(columns)}</main>\n"
         f"<footer><p>gsopt {escape(__version__)}. Short runs on small images rank prompts; they do not measure the "
         "final quality. Differences of a few tenths of a dB may be chance.</p></footer>",
     )
@@ -68,11 +68,11 @@ def _table(views: Sequence[str], columns: Sequence[Column]) -> str:
     )
 
 
-def _pictures(views: Sequence[str], truths: Sequence[Image.Image], columns: Sequence[Column]) -> str:
+def _images(views: Sequence[str], truths: Sequence[Image.Image], columns: Sequence[Column]) -> str:
     rows = []
     for number, view in enumerate(views):
         shown = [("photo", truths[number])]
-        shown += [(f"{column.name} · {column.psnrs[number]:.2f} dB", column.pictures[number]) for column in columns]
+        shown += [(f"{column.name} · {column.psnrs[number]:.2f} dB", column.images[number]) for column in columns]
         figures = "".join(
             f'<figure><img src="{data_uri(image)}" alt=""><figcaption>{escape(name)}</figcaption></figure>'
             for name, image in shown

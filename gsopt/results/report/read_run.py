@@ -16,6 +16,7 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
 from gsopt.events import LARGEST_METRICS, read_events
 from gsopt.geometry.cameras import Cameras
+from gsopt.results.evaluation import evenly_spread
 from gsopt.results.finished_run import FinishedRun, camera_path, open_run, truth, with_longest_side
 from gsopt.results.report.cameras_section import cameras_section
 from gsopt.results.report.embedded_images import shrunk
@@ -189,8 +190,7 @@ def _add_figures(report: Report) -> None:
 
 def _add_inputs(report: Report, scene: Scene) -> None:
     background = torch.ones(3)
-    shown = min(MAX_INPUT_VIEWS, len(scene.train))
-    views = [scene.train[i * len(scene.train) // shown] for i in range(shown)]
+    views = evenly_spread(scene.train, MAX_INPUT_VIEWS)
     report.inputs = [(view.name, shrunk(as_image(truth(view, background)), 200)) for view in views]
     report.input_count, report.test_count = len(scene.train), len(scene.test)
 
@@ -205,11 +205,13 @@ def _add_renders(report: Report, finished: FinishedRun, scene: Scene) -> None:
         report.evaluated.append(_evaluated_view(finished, views[rows[index]["name"]], rows[index], badge))
     size = scene.train[0].camera
     cameras = Cameras.cat([view.camera.resized(size.width, size.height) for view in scene.train])
-    film = camera_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
+    path_cameras = camera_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
     side = min(TURNTABLE_SIDE, 2 * max(size.width, size.height))
-    report.turntable = [as_image(finished.draw(with_longest_side(film[i], side))) for i in range(len(film))]
+    report.turntable = [
+        as_image(finished.draw(with_longest_side(path_cameras[i], side))) for i in range(len(path_cameras))
+    ]
 
 
 def _evaluated_view(finished: FinishedRun, view: View, row: dict[str, Any], badge: str) -> EvaluatedView:
-    picture, target = as_image(finished.draw(view.camera)), as_image(truth(view, finished.background))
-    return EvaluatedView(view.name, badge, {key: row[key] for key in METRICS}, picture, target)
+    render, target = as_image(finished.draw(view.camera)), as_image(truth(view, finished.background))
+    return EvaluatedView(view.name, badge, {key: row[key] for key in METRICS}, render, target)
