@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from dataclasses import dataclass
+from typing import Literal
 
 from gsopt import check
 from gsopt.errors import UsageError
 
-T = TypeVar("T")
 MOST = 1e9
 """Upper bound of weights: keeps infinities and typing errors out."""
 
@@ -133,25 +132,3 @@ class GuidanceConfig:
         check.at_least("--guidance.guard-steps", self.guard_steps, 2, "The default is 240.")
         if self.size:
             check.within("--guidance.size", self.size, 8, 4096, "0 takes what the prior was made for.")
-
-
-def sure(value: T | None) -> T:
-    """A value of a settled configuration: nothing in it is left open."""
-    assert value is not None
-    return value
-
-
-def settled(config: GuidanceConfig, view_conditioned: bool) -> GuidanceConfig:
-    """The same with what was left to gsopt decided, for a prior of that kind."""
-    policy = config.policy if config.policy != "auto" else "recon" if view_conditioned else "sds"
-    scale, steps, certain, least = (1.0, 1, 1.0, 0.0) if view_conditioned else (3.0, 5, 0.0, 0.05)
-    every = 2 if policy == "recon" else 10
-    return replace(
-        config,
-        policy=policy,
-        guidance_scale=scale if config.guidance_scale is None else config.guidance_scale,
-        every=every if config.every is None else config.every,
-        denoise_steps=steps if config.denoise_steps is None else config.denoise_steps,
-        min_uncertainty=least if config.min_uncertainty is None else config.min_uncertainty,
-        certain_weight=certain if config.certain_weight is None else config.certain_weight,
-    )

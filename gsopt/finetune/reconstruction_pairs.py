@@ -27,13 +27,13 @@ from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, RasterSettings
 from gsopt.sds import coverage
 from gsopt.sds.candidate_views import nearest, square, square_views
-from gsopt.sds.guidance_step import depth_in
 from gsopt.sds.noise import generator
+from gsopt.sds.observed_render import depth_in
 from gsopt.sds.priors.protocol import References
 from gsopt.sds.priors.view_conditioned import WARPED
 from gsopt.sds.warp import warp
-from gsopt.training import schedule
 from gsopt.training.mirror_images import with_mirrors
+from gsopt.training.plan import RunPlan
 from gsopt.training.trainer import Trainer
 
 INPUTS = (3, 4, 4, 5, 6, 8)
@@ -117,20 +117,19 @@ def _dealt(scene: Scene, random: torch.Generator) -> tuple[list[View], list[View
 def reconstruction_config(length: int, seed: int) -> TrainConfig:
     """A run of `length` steps, as a user's but for its size."""
     return TrainConfig(
-        iterations=length,
         init=InitConfig(count=5000),
         density=DensityConfig(refine_start=length // 10, max_gaussians=20_000),
         checkpoint_every=0,
         preview_every=0,
         seed=seed,
-    )
+    ).with_steps(length)
 
 
 def fitted(config: TrainConfig, scene: Scene, backend: Backend) -> Iterator[Gaussians]:
     """The Gaussians of a run after a third of it and at its end."""
-    degree = schedule.max_sh_degree(config, len(scene.train))
-    gaussians, _ = first_gaussians(scene, config.init, degree, config.seed)
-    trainer = Trainer(config, scene, gaussians, backend)
+    plan = RunPlan.of(config, scene)
+    gaussians, _ = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
+    trainer = Trainer(plan, scene, gaussians, backend)
     for end in (config.iterations // 3, config.iterations):
         while trainer.step < end:
             trainer.advance()

@@ -1,4 +1,4 @@
-"""From where guidance looks: candidate cameras around the subject, the word for each, and square input views."""
+"""Candidate cameras of guidance around the object, the word for each of their sides, and square input views."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ FRONT = math.radians(45)
 
 @dataclass(frozen=True)
 class GuidanceCameras:
-    """Where the subject is and how the input cameras stand around it."""
+    """The candidate cameras, and the place of the object among the input cameras."""
 
     focus: Float[Tensor, "3"]
     up: Float[Tensor, "3"]
     ahead: Float[Tensor, "3"]
     """Horizontal unit vector from the focus to the front: to the camera that shows it."""
     distance: float
-    """Of the guidance cameras to the focus, scene units."""
+    """Distance of the guidance cameras to the focus, scene units."""
     K: Float[Tensor, "3 3"]
     size: int
     """Side of the guided renders, px."""
     candidates: Cameras
     angles: Float[Tensor, "C 2"] | None
-    """Azimuth from the front and elevation of every candidate; None for a capture without a subject in the middle."""
+    """Azimuth from the front and elevation of every candidate; a capture without an object in the middle has none."""
 
     def camera(self, index: int, generator: torch.Generator | None = None) -> Cameras:
         """A candidate; with a generator moved a little, so that no two steps look from the same place."""
@@ -112,7 +112,7 @@ def ring_angles(mean_elevation: float) -> Float[Tensor, "C 2"]:
 
 
 def draw_candidate(mean_u: Float[Tensor, "C"], least: float, generator: torch.Generator) -> int | None:
-    """A candidate, with probability proportional to its mean uncertainty; None where all lie below `least`."""
+    """A candidate, with probability proportional to its mean uncertainty. Draws none (None) when all lie below `least`."""
     chances = torch.where(mean_u >= least, mean_u.double(), 0.0)
     if float(chances.sum()) <= 0:
         return None

@@ -1,8 +1,8 @@
-"""How much the input views say about each Gaussian, and where a new view shows what they do not.
+"""Coverage of each Gaussian by the input views, and the uncertainty of a new view that follows.
 
     coverage_i = sum over input views of  visible · facing,        uncertainty u_i = exp(-coverage_i)
 
-visible: the centre projects into the view and nothing opaque lies before it. facing: 1 for a Gaussian as round as a
+visible: the center projects into the view and nothing opaque lies before it. facing: 1 for a Gaussian as round as a
 ball, less for a flat one seen edge-on. Rendered as a color, u tells for every pixel how free the inputs left it.
 """
 
@@ -29,7 +29,7 @@ MAX_VIEWS = 32
 DEPTH_MAP_SIDE = 128
 """Longer side of the depth maps, px."""
 DEPTH_SLACK = 0.02
-"""Share of the depth by which a centre may lie behind the surface and still count as visible."""
+"""Share of the depth by which a center may lie behind the surface and still count as visible."""
 SCALE_SLACK = 2.0
 """The same in largest standard deviations of the Gaussian."""
 SOLID = 0.5
@@ -40,7 +40,7 @@ PLAIN = RasterSettings(sh_degree=0)
 
 
 def coverage(gaussians: Gaussians, inputs: Sequence[Cameras], backend: Backend) -> Float[Tensor, "N"]:
-    """How many input views see each Gaussian; at most MAX_VIEWS."""
+    """Number of input views that see each Gaussian; at most MAX_VIEWS."""
     total = torch.zeros(len(gaussians))
     for camera in spread(inputs):
         total += seen(gaussians, _small(camera), backend)
@@ -67,7 +67,7 @@ def seen(gaussians: Gaussians, camera: Cameras, backend: Backend) -> Float[Tenso
 
 
 def facing(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "N"]:
-    """How squarely an eye sees each Gaussian: 1 for balls; for discs a smooth step over |cos| to the shortest axis."""
+    """Share in which an eye faces each Gaussian: 1 for balls; for discs a smooth step over |cos| to the shortest axis."""
     scales = gaussians.scales
     order = scales.sort(dim=-1)
     normal = rotation_matrices(gaussians.quats).gather(2, order.indices[:, None, :1].expand(-1, 3, 1))[..., 0]
@@ -98,8 +98,8 @@ def mean_uncertainty(
 
 def _painted(gaussians: Gaussians, u: Float[Tensor, "N"]) -> Gaussians:
     """The same shapes with u as their color from every side."""
-    grey = u.to(gaussians.means)[:, None, None].expand(-1, 1, 3)
-    return replace(gaussians, sh0=sh0_from_rgb(grey).contiguous(), shN=gaussians.shN[:, :0].contiguous())
+    gray = u.to(gaussians.means)[:, None, None].expand(-1, 1, 3)
+    return replace(gaussians, sh0=sh0_from_rgb(gray).contiguous(), shN=gaussians.shN[:, :0].contiguous())
 
 
 def spread(inputs: Sequence[Cameras]) -> list[Cameras]:

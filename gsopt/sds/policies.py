@@ -1,4 +1,4 @@
-"""What a prior's opinion becomes: a target for the render, and a loss whose gradient is known in closed form.
+"""Guidance losses: a prior's prediction becomes a target for the render, with the gradient in closed form.
 
     (1)  L = 1/2 mean( u (z - sg[z - g])^2 )          so that dL/dz = u g / numel,   sg: no gradient passes
 
@@ -12,8 +12,8 @@ recon compares pixels instead, by the distance that most of the photometric loss
 
     (2)  L = mean( u sqrt((x - y)^2 + e^2) ),   y denoised from z_t, e = ROUNDING
 
-y is kept for some hundred steps, in which the render goes on from the x' it was made of. What the prior wanted is
-y - x', so u is multiplied by how much that is, and by 0 where the render has passed y by itself: else an old target,
+y is kept for some hundred steps, in which the render goes on from the x' it was made of. The prior's change is
+y - x', so u is multiplied by its size, and by 0 where the render has passed y by itself: else an old target,
 which is mostly an old render, would hold the reconstruction back.
 
     (3)  u' = u c^2 / (c^2 + CHANGE_SCALE^2) [c (y - x) > 0],   c = y - x'
@@ -39,7 +39,7 @@ CHANGE_SCALE = 0.05
 
 @dataclass(frozen=True)
 class NoiseSample:
-    """How one guided step looks at its render: its random numbers, and the settings that matter to it."""
+    """Random numbers and settings of one guided step."""
 
     t: int
     eps: Latents
@@ -52,7 +52,7 @@ class NoiseSample:
 
 @dataclass(frozen=True)
 class GuidanceGradient:
-    """Where the prior wants the render to go."""
+    """The gradient of score distillation and the estimate it comes from."""
 
     g: Latents
     """dL/dz times numel, before the pixel weights."""

@@ -1,1 +1,1 @@
-"""How Gaussians are changed until they look like the input views; `loop.train` is the way in."""
+"""Optimizes Gaussians until they match the input views; `loop.train` is the way in."""

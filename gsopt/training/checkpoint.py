@@ -19,13 +19,13 @@ from gsopt.events import Report
 
 VERSION = 1
 KEEP = 2
-"""How many of the newest are kept: the last may have met a full disk or a power cut."""
+"""Number of the newest that are kept: the last may have met a full disk or a power cut."""
 NAME = re.compile(r"step_(\d+)\.safetensors")
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a run needs to go on as if it had never stopped."""
+    """The state a run needs to go on as if it had never stopped."""
 
     path: Path
     tensors: dict[str, Tensor]
@@ -61,7 +61,7 @@ def saved(folder: Path) -> list[Path]:
 
 
 def load_newest(folder: Path, warn: Report) -> Checkpoint | None:
-    """The newest checkpoint that can be read, None where there is none; every broken one is told to `warn`."""
+    """The newest checkpoint that can be read, None where there is none; every broken one is reported to `warn`."""
     for path in saved(folder):
         try:
             return read_checkpoint(path)

@@ -1,4 +1,4 @@
-"""The part of a masked image that shows something: the rest is background, and drawing it would say so again."""
+"""The window of a masked image outside of which there is only background, which need not be drawn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MARGIN = 16
 # The window begins at a multiple of this, px, so that the kernels' tiles lie where they lie in the whole image.
 TILE = 16
 # A window larger than this share of the image is not worth the copy.
-MOST_SHARE = 0.9
+MAX_SHARE = 0.9
 # One step in this many draws the whole image: what hangs far beside the object is seen and goes.
 WHOLE_EVERY = 8
 
@@ -40,7 +40,7 @@ class Window:
 
 
 def content_window(alphas: Float[Tensor, "H W"] | None) -> Window | None:
-    """The box of all that is not fully transparent, with a margin; None where that is nothing or nearly everything."""
+    """The box of all that is not fully transparent, with a margin; no window where that is nothing or nearly everything."""
     if alphas is None:
         return None
     shown = alphas > 0
@@ -50,9 +50,9 @@ def content_window(alphas: Float[Tensor, "H W"] | None) -> Window | None:
     height, width = alphas.shape
     y0, x0 = (max(0, found[0] - MARGIN) // TILE * TILE for found in (rows, columns))
     y1, x1 = min(height, rows[-1] + 1 + MARGIN), min(width, columns[-1] + 1 + MARGIN)
-    return Window(y0, y1, x0, x1) if (y1 - y0) * (x1 - x0) < MOST_SHARE * height * width else None
+    return Window(y0, y1, x0, x1) if (y1 - y0) * (x1 - x0) < MAX_SHARE * height * width else None
 
 
 def draws_whole(step: int) -> bool:
-    """Whether this step draws the whole image although masked images are cropped."""
+    """True when this step draws the whole image although masked images are cropped."""
     return step % WHOLE_EVERY == 0

@@ -1,4 +1,4 @@
-"""Finds Gaussians that hang alone in space by the distance to their neighbours (GaussianObject, Yang et al. 2024)."""
+"""Finds Gaussians that hang alone in space by the distance to their neighbors (GaussianObject, Yang et al. 2024)."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# Neighbours are looked for among at most this many Gaussians: the estimate of the local density stays, the cost does
+# Neighbors are looked for among at most this many Gaussians: the estimate of the local density stays, the cost does
 # not grow with the square of N. The rows are in Morton order, so that an even stride is an even sample of space.
-MOST_REFERENCES = 1024
-FEWEST = 64
+MAX_REFERENCES = 1024
+MIN_GAUSSIANS = 64
 """Below this many Gaussians the statistics mean nothing and none is called a floater."""
-LEAST_SPREAD = 0.01
+MIN_RELATIVE_STD = 0.01
 """Smallest standard deviation, as a share of the mean: where all are alike, rounding alone makes no floater."""
 CHUNK = 1024
 
 
 def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:
-    """Whether the mean distance to the nearest neighbours exceeds its average by `sigmas` standard deviations."""
-    if len(means) < FEWEST:
+    """True where the mean distance to the nearest neighbors exceeds its average by `sigmas` standard deviations."""
+    if len(means) < MIN_GAUSSIANS:
         return torch.zeros(len(means), dtype=torch.bool)
     distances = neighbor_distances(means)
     mean = distances.mean()
-    return distances > mean + sigmas * torch.maximum(distances.std(), LEAST_SPREAD * mean)
+    return distances > mean + sigmas * torch.maximum(distances.std(), MIN_RELATIVE_STD * mean)
 
 
 def neighbor_distances(means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Mean distance, scene units, to the nearest √N neighbours, or to the same share of at most 1024 references."""
+    """Mean distance, scene units, to the nearest √N neighbors, or to the same share of at most 1024 references."""
     count = len(means)
-    stride = -(-count // MOST_REFERENCES)
+    stride = -(-count // MAX_REFERENCES)
     references = means[::stride]
     nearest = max(3, round(math.sqrt(count) / stride))
     chunks = []

@@ -21,31 +21,31 @@ from gsopt.gaussians import Gaussians
 from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
-from gsopt.training import schedule
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.finite import require_finite, require_finite_loss
 from gsopt.training.guided.session import RunGuidance
 from gsopt.training.guided.start import start_guidance
 from gsopt.training.interrupt import StopRequest
 from gsopt.training.mirror_images import with_recorded_mirrors
+from gsopt.training.plan import RunPlan
 from gsopt.training.run_directory import Listener, RunDirectory, opened
 from gsopt.training.trainer import Trainer
 
 PROGRESS_SECONDS = 0.5
-# Every parameter is looked at this often; the loss is looked at in every step.
+# Steps between two checks that every parameter is finite; the loss is checked in every step.
 FINITE_EVERY = 100
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a run left behind."""
+    """The outcome of a run."""
 
     run: Path
     gaussians: Gaussians
     scene: Scene
     backend: str
     init: str
-    """How the first Gaussians were made."""
+    """Method that made the first Gaussians, and why."""
     steps: int
     """Steps taken, earlier sessions of a resumed run included."""
     stopped: bool
@@ -53,16 +53,16 @@ class TrainResult:
     train_seconds: float
     """Wall time of the steps, checkpoints and previews; without reading the data and making the first Gaussians."""
     cpu_seconds: float
-    """CPU time of all threads over the same stretch: what other work on the machine does not add to."""
+    """CPU time of all threads over the same stretch: other work on the machine does not add to it."""
     peak_memory_mb: float | None
-    """Largest resident set of this process since it started, interpreter and libraries included; None on Windows."""
+    """Largest resident set of this process since it started, interpreter and libraries included; Windows has none."""
 
 
 @torch.no_grad()
 def train(
     config: TrainConfig, run: Path, *, resume: bool = False, on_progress: Listener | None = None, done: bool = True
 ) -> TrainResult:
-    """Optimise Gaussians for the scene in `config.data` and write `run` (see gsopt/events.py for what is in there).
+    """Optimize Gaussians for the scene in `config.data` and write `run` (see gsopt/events.py for what is in there).
 
     `resume` continues from the newest checkpoint in `run`, with the same bits as if it had never stopped; without
     one it starts. `on_progress` is called with every event. `done`: end with the event `done`; a caller that adds an
@@ -77,9 +77,9 @@ def train(
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
             scene = with_recorded_mirrors(config, scene, directory)
-            config = schedule.shortened(config, len(scene.train))
-            guidance = start_guidance(config, scene, backend, directory)
-            trainer, clock = _start(config, scene, backend, directory, guidance, began)
+            plan = RunPlan.of(config, scene)
+            guidance = start_guidance(config, plan, scene, backend, directory)
+            trainer, clock = _start(plan, scene, backend, directory, guidance, began)
             stopped = _advance(trainer, directory, stop, clock)
             _finish(trainer, directory, clock)
             if guidance is not None:
@@ -122,7 +122,7 @@ class Clock:
     def __init__(self, step: int, seconds: float, cpu_seconds: float) -> None:
         self._began = time.perf_counter() - seconds
         self._cpu_began = time.process_time() - cpu_seconds
-        self._told, self._told_step = time.perf_counter(), step
+        self._reported, self._reported_step = time.perf_counter(), step
         self._rate = 0.0
 
     def seconds(self) -> float:
@@ -132,24 +132,24 @@ class Clock:
         return time.process_time() - self._cpu_began
 
     def spent(self) -> dict[str, float]:
-        """What a checkpoint keeps, for the next session to go on from."""
+        """Kept in a checkpoint, for the next session to go on from."""
         return {"seconds": self.seconds(), "cpu_seconds": self.cpu_seconds()}
 
     def is_due(self) -> bool:
-        """Whether progress was last told long enough ago."""
-        return time.perf_counter() - self._told >= PROGRESS_SECONDS
+        """True when progress was last reported long enough ago."""
+        return time.perf_counter() - self._reported >= PROGRESS_SECONDS
 
     def rate(self, step: int) -> float:
         """Steps per second, averaged over the last few calls."""
         now = time.perf_counter()
-        rate = (step - self._told_step) / max(now - self._told, 1e-9)
+        rate = (step - self._reported_step) / max(now - self._reported, 1e-9)
         self._rate = rate if self._rate == 0 else 0.7 * self._rate + 0.3 * rate
-        self._told, self._told_step = now, step
+        self._reported, self._reported_step = now, step
         return self._rate
 
 
 def _start(
-    config: TrainConfig,
+    plan: RunPlan,
     scene: Scene,
     backend: Backend,
     directory: RunDirectory,
@@ -160,20 +160,19 @@ def _start(
     names = [view.name for view in scene.train]
     checkpoint = load_newest(directory.checkpoints, directory.warn)
     if checkpoint is None:
-        highest = schedule.max_sh_degree(config, len(names))
-        gaussians, init = first_gaussians(scene, config.init, highest, config.seed)
+        gaussians, init = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
         if len(gaussians) == 0:
             raise InputError(f"`{init}` made no Gaussians. Choose another --init.")
-        directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin))
-        trainer, spent = Trainer(config, scene, gaussians, backend, guidance), (0.0, 0.0)
+        directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin), plan=plan.to_dict())
+        trainer, spent = Trainer(plan, scene, gaussians, backend, guidance), (0.0, 0.0)
     else:
         if names != directory.recorded("train_views"):
-            raise InputError(f"{config.data.path} has other views than when the run began. Start in another folder.")
-        trainer = Trainer.resumed(config, scene, backend, checkpoint, guidance)
+            raise InputError(f"{scene.path} has other views than when the run began. Start in another folder.")
+        trainer = Trainer.resumed(plan, scene, backend, checkpoint, guidance)
         spent = (float(checkpoint.meta.get("seconds", 0.0)), float(checkpoint.meta.get("cpu_seconds", 0.0)))
     directory.emit(
         "started",
-        total=config.iterations,
+        total=plan.schedule.iterations,
         step=trainer.step,
         pid=os.getpid(),
         backend=backend.name,
@@ -182,7 +181,7 @@ def _start(
         train_views=len(names),
         test_views=len(scene.test),
         mirrors=len(scene.mirrored) // len(names),
-        sparse=schedule.is_sparse(config, len(names)),
+        sparse=plan.sparse,
         guidance=directory.recorded("guidance"),
         setup_cpu_seconds=round(time.process_time() - began, 3),
     )
@@ -193,20 +192,20 @@ def _start(
 
 def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:
     """Step until the end; True when asked to stop before it."""
-    config = trainer.config
-    while trainer.step < config.iterations and not trainer.finished_early:
+    plan = trainer.plan
+    while not trainer.finished:
         if stop:
             return True
         loss, view = trainer.advance()
         require_finite_loss(loss, view, trainer.step, _last_good(directory))
         if trainer.step % FINITE_EVERY == 0:
-            _guard(trainer, directory)
-        if is_due(trainer.step, config.checkpoint_every):
+            _check_finite(trainer, directory)
+        if is_due(trainer.step, plan.checkpoint_every):
             _save(trainer, directory, clock)
-        if is_due(trainer.step, config.preview_every):
+        if is_due(trainer.step, plan.preview_every):
             _preview(trainer, directory)
-        if clock.is_due() or trainer.step == config.iterations or trainer.finished_early:
-            _tell(trainer, directory, clock)
+        if clock.is_due() or trainer.finished:
+            _report_progress(trainer, directory, clock)
     return False
 
 
@@ -217,37 +216,37 @@ def is_due(step: int, every: int) -> bool:
 def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
     _save(trainer, directory, clock)
-    save_splats(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.config.antialiased)
+    save_splats(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.plan.antialiased)
     if trainer.poses is not None:
         write_atomic(directory.path / "poses.json", to_json(trainer.poses.record(trainer.scene.origin)))
 
 
 def _save(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
-    """A checkpoint, never of numbers that are no longer numbers."""
-    _guard(trainer, directory)
+    """A checkpoint, of finite numbers only."""
+    _check_finite(trainer, directory)
     tensors, meta = trainer.state()
     save_checkpoint(directory.checkpoints, trainer.step, tensors, {**meta, **clock.spent()})
 
 
 def _preview(trainer: Trainer, directory: RunDirectory) -> None:
     """The splats so far: written, closed, then announced."""
-    _guard(trainer, directory)
+    _check_finite(trainer, directory)
     path = directory.previews / f"step_{trainer.step:06d}.ply"
-    save_splats(path, trainer.model.gaussians, antialiased=trainer.config.antialiased)
+    save_splats(path, trainer.model.gaussians, antialiased=trainer.plan.antialiased)
     directory.emit("preview", step=trainer.step, path=path.relative_to(directory.path).as_posix())
 
 
-def _tell(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
-    if trainer.shown.loss is None:  # so far only mirror images were drawn
+def _report_progress(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
+    if trainer.means.loss is None:  # so far only mirror images were drawn
         return
     rate = clock.rate(trainer.step)
-    left = trainer.config.iterations - trainer.step
-    psnr = trainer.shown.psnr
+    left = trainer.plan.schedule.iterations - trainer.step
+    psnr = trainer.means.psnr
     directory.emit(
         "progress",
         step=trainer.step,
-        total=trainer.config.iterations,
-        loss=trainer.shown.loss,
+        total=trainer.plan.schedule.iterations,
+        loss=trainer.means.loss,
         psnr=None if psnr is None else round(psnr, 3),
         n=len(trainer.model),
         steps_per_second=round(rate, 3),
@@ -257,7 +256,7 @@ def _tell(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     )
 
 
-def _guard(trainer: Trainer, directory: RunDirectory) -> None:
+def _check_finite(trainer: Trainer, directory: RunDirectory) -> None:
     require_finite(trainer.model.gaussians.items(), trainer.step, _last_good(directory))
 
 

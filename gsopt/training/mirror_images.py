@@ -6,14 +6,14 @@ from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.symmetry.find import Symmetry, find_symmetries, with_mirror_images
-from gsopt.training import schedule
+from gsopt.training.plan import is_sparse
 from gsopt.training.run_directory import RunDirectory
 
 
 def symmetries(config: TrainConfig, scene: Scene) -> list[Symmetry]:
     """The mirrors this run uses: none unless the photos are few and all have alpha. Not while poses are corrected:
     their errors would go into the mirrors."""
-    few = schedule.is_sparse(config, len(scene.train))
+    few = is_sparse(config.sparse, len(scene.train))
     wanted = few and config.sparse.symmetry == "auto" and not config.poses.refine
     return find_symmetries(scene) if wanted else []
 

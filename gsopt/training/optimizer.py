@@ -1,4 +1,4 @@
-"""Gaussians together with what Adam remembers of them, and one optimiser step."""
+"""Gaussians with the moments of Adam, and one optimizer step."""
 
 from __future__ import annotations
 

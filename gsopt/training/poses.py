@@ -4,7 +4,7 @@ A view with cam_from_world V is replaced by exp(xi) V, xi = (omega, tau): the wo
 omega about the camera and shifted by tau. No kernel has to differentiate a camera: turning and shifting the Gaussians
 as the view sees them draws the same picture, so dL/dxi follows from dL/dmeans and dL/dquats (docs/math.md, eq. 23).
 Color is the one thing that does not move along: it is looked up in the world's direction from camera to Gaussian,
-which a camera that turns on the spot does not change. What dL/dmeans owes to it is taken out for omega; for tau it
+which a camera that turns on the spot does not change. Its share of dL/dmeans is taken out for omega; for tau it
 belongs in. Nothing is neglected but the edges of the rasterizer's culling.
 """
 
@@ -75,7 +75,7 @@ class PoseRefinement:
         return math.exp((1 - share) * math.log(self.config.lr) + share * math.log(self.config.lr_final))
 
     def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps."""
+        """The state, for a checkpoint."""
         own = (self.viewmats, self._whitening, self._exp_avg, self._exp_avg_sq, self._steps)
         return dict(zip(TENSORS, own, strict=True))
 
@@ -85,7 +85,7 @@ class PoseRefinement:
             own.copy_(_of_shape(tensors[name], own, name))
 
     def moved(self) -> tuple[Float[Tensor, "C"], Float[Tensor, "C"]]:
-        """How far each view went from where it was given: degrees, scene units."""
+        """Distance of each view from where it was given: degrees, scene units."""
         apart = self.viewmats[:, :3, :3] @ self.given[:, :3, :3].mT
         sine = (apart - apart.mT).square().sum((1, 2)).div(8).sqrt()
         cosine = (apart.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2

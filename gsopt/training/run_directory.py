@@ -52,7 +52,7 @@ class RunDirectory:
         write_atomic(self.path / "config.json", to_json({**document, **fields}))
 
     def recorded(self, key: str) -> Any:
-        """What `record` wrote under this key, in this process or an earlier one; None if nothing."""
+        """The value that `record` wrote under this key, in this process or an earlier one, or None."""
         return json.loads((self.path / "config.json").read_bytes()).get(key)
 
 
@@ -104,7 +104,7 @@ def sweep(*folders: Path) -> None:
 
 
 def versions() -> dict[str, str]:
-    """What made the run: a rerun with the same versions gives the same bits."""
+    """Versions of the software: a rerun with the same versions gives the same bits."""
     packages = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {
         "gsopt": __version__,

@@ -26,7 +26,7 @@ class Resting:
         self.resting: Bool[Tensor, "V"] = torch.zeros(views, dtype=torch.bool)
 
     def skips(self, view: int) -> bool:
-        """Whether this visit is left out; the next one is not."""
+        """True when this visit is left out; the next one is not."""
         rests = bool(self.resting[view])
         self.resting[view] = False
         return rests
@@ -61,7 +61,7 @@ class Bands:
         self._sums: dict[str, Tensor] = {}
 
     def watches(self, step: int) -> bool:
-        """Whether this step's gradients count for the next decision."""
+        """True when this step's gradients count for the next decision."""
         return self.degree < self._highest and 0 <= -step % self._every < min(self.STEPS, self._every)
 
     def note(self, gaussians: Gaussians, camera: Cameras, gradients: Gradients) -> None:

@@ -1,4 +1,4 @@
-"""What a step compares the rendering with: a view's pixels on a background, as floats, at the step's resolution."""
+"""The images a step compares its rendering with: views on a background, as floats, at the step's resolution."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Target:
     colors: Float[Tensor, "H W 3"]
     """On the background of the step."""
     alphas: Float[Tensor, "H W"] | None
-    """None where the image has no alpha and no mask."""
+    """Absent (None) for an image without alpha and mask."""
     size: tuple[int, int]
     """Height and width of the whole image, px, of which this may be a window."""
     color: float = 1.0
@@ -31,12 +31,12 @@ class Target:
 
     @property
     def share(self) -> float:
-        """Of the whole image's pixels."""
+        """Share of the whole image's pixels."""
         return self.colors.shape[0] * self.colors.shape[1] / (self.size[0] * self.size[1])
 
 
 def content_pixels(views: Sequence[View], most: int = 16) -> float:
-    """How many pixels of an image show something, alpha counted as a share: the mean over up to `most` spread views."""
+    """Number of pixels of an image that show something, weighted by alpha: the mean over up to `most` spread views."""
     count = min(most, len(views))
     chosen = [views[i * len(views) // count] for i in range(count)]
     return sum(_content(view.pixels()) for view in chosen) / len(chosen)
@@ -48,7 +48,7 @@ def _content(pixels: UInt8[Tensor, "H W C"]) -> float:
 
 
 class Targets:
-    """Float targets of all input views. Keeps as many as fit into `budget` bytes, in the order they are asked for.
+    """Float targets of all input views. Keeps as many as fit into `budget` bytes, in the order of their first use.
 
     With a fixed background the composited color is kept; with a random one the premultiplied color, to which the
     background is added at every step.

@@ -1,4 +1,4 @@
-"""One optimisation, step by step, and everything that a checkpoint must carry to continue it bit for bit."""
+"""One optimization, step by step, and everything that a checkpoint must carry to continue it bit for bit."""
 
 from __future__ import annotations
 
@@ -10,41 +10,39 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.config.train import BACKGROUNDS, TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.morton import morton_order
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
-from gsopt.training import schedule
 from gsopt.training.checkpoint import Checkpoint
 from gsopt.training.content_window import draws_whole
 from gsopt.training.density import at_least_one, make_density
 from gsopt.training.floaters import solitary
-from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
+from gsopt.training.optimizer import OptimizedGaussians, adam_step
+from gsopt.training.plan import RunPlan
 from gsopt.training.poses import PoseRefinement
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
+from gsopt.training.schedule import Flatness
 from gsopt.training.skipping import Bands, Resting
-from gsopt.training.targets import Target, Targets, content_pixels
+from gsopt.training.targets import Target, Targets
 from gsopt.training.view_order import ViewOrder, generators
 
 if TYPE_CHECKING:
     from gsopt.training.guided.session import RunGuidance
 
-# The PSNR that is shown is taken every so many steps: the mean squared error costs a pass over the image.
+# Steps between two measurements of the PSNR that is displayed: the mean squared error costs a pass over the image.
 PSNR_EVERY = 10
-# Share of a new value in the running means that are shown.
-NEWS = 0.05
-# Most memory for float targets, as a share of the decoded images': both hold the same views.
-TARGET_SHARE = 0.5
+# Share of a new value in the running means that are displayed.
+NEW_VALUE_SHARE = 0.05
 # The parts of a model that a checkpoint carries.
 RECORDS = ("gaussians", "exp_avg", "exp_avg_sq")
 
 
 @dataclass
-class Shown:
-    """Running means over steps, for people: nothing is decided by them."""
+class RunningMeans:
+    """Running means over steps, for display: nothing is decided by them."""
 
     loss: float | None = None
     mse: float | None = None
@@ -60,50 +58,39 @@ class Trainer:
 
     def __init__(
         self,
-        config: TrainConfig,
+        plan: RunPlan,
         scene: Scene,
         gaussians: Gaussians,
         backend: Backend,
         guidance: RunGuidance | None = None,
     ) -> None:
         """`guidance` None: learn from the input views alone."""
-        views = len(scene.train)
-        self.config = config
+        self.plan = plan
         self.scene = scene
         self.backend = backend
         self.step = 0
-        self.shown = Shown()
+        self.means = RunningMeans()
         self._spent: Gradients | None = None  # the last step's gradients: their memory serves again
         self._guidance = guidance
-        self.poses = PoseRefinement(config.poses, scene, config.iterations) if config.poses.refine else None
-        self._sparse = schedule.is_sparse(config, views)
-        self._settling = schedule.settling_steps(config, views)
-        self._last = config.iterations
-        self._weights = schedule.weights(config, views)
-        self._max_sh_degree = schedule.max_sh_degree(config, views)
-        self._generators = generators(config.seed)
-        images = len(scene.mirrored)
-        per_epoch = schedule.mirrored_per_epoch(views, images)
-        self._order = ViewOrder(views, self._generators["views"], images, per_epoch)
-        self._flatness = schedule.Flatness.of(views + per_epoch)
+        self._schedule = plan.schedule
+        self._last = plan.schedule.iterations
+        self.poses = PoseRefinement(plan.poses, scene, self._last) if plan.poses.refine else None
+        self._generators = generators(plan.seed)
+        views, images = len(scene.train), len(scene.mirrored)
+        self._order = ViewOrder(views, self._generators["views"], images, plan.mirrored_per_epoch)
+        self._flatness = Flatness.of(views + plan.mirrored_per_epoch)
         self._resting = Resting(views + images)
-        self._bands = Bands(config.optimizer.sh_degree_every, self._max_sh_degree)
-        fixed = BACKGROUNDS.get(config.data.background)
-        self._background = None if fixed is None else torch.tensor(fixed)
-        self._targets = Targets(scene.drawn, self._background, int(TARGET_SHARE * config.data.cache_mb * 1e6))
-        self._extent = scene.extent
-        self._coarse_until = schedule.coarse_until(config, views)
-        self._budget = schedule.max_gaussians(config, content_pixels(scene.train))
+        self._bands = Bands(plan.schedule.optimizer.sh_degree_every, plan.schedule.max_sh_degree)
+        self._targets = Targets(scene.drawn, plan.background.constant(), int(plan.target_cache_mb * 1e6))
         self.model = OptimizedGaussians.start(self._first(gaussians))
-        bounded = replace(config, density=replace(config.density, max_gaussians=self._budget))
-        self._density = make_density(bounded, self._extent, len(self.model), self._generators["density"])
+        self._density = make_density(plan.density, plan.schedule, len(self.model), self._generators["density"])
 
     def _first(self, gaussians: Gaussians) -> Gaussians:
         """The first Gaussians within the budget, in Morton order, as float32 with the run's bands."""
-        gaussians = gaussians.to(torch.float32).with_sh_degree(self._max_sh_degree)
-        if len(gaussians) > self._budget:
+        gaussians = gaussians.to(torch.float32).with_sh_degree(self._schedule.max_sh_degree)
+        if len(gaussians) > self.plan.density.max_gaussians:
             chosen = torch.randperm(len(gaussians), generator=self._generators["density"])
-            gaussians = gaussians.select(chosen[: self._budget])
+            gaussians = gaussians.select(chosen[: self.plan.density.max_gaussians])
         return gaussians.select(morton_order(gaussians.means))
 
     def advance(self) -> tuple[float, str]:
@@ -112,9 +99,9 @@ class Trainer:
         index = self._order.next()
         if self._rests(index):
             return self._passed(index)
-        background = self._background if self._background is not None else self._random_background()
-        factor = schedule.downscale(self.step, self._coarse_until)
-        whole = not self.config.schedule.crop_masked or draws_whole(self.step)
+        background = self.plan.background.drawn(self._generators["background"])
+        factor = self._schedule.downscale(self.step)
+        whole = not self.plan.crop_masked or draws_whole(self.step)
         target = self._targets.get(index, factor, background, whole=whole)
         settings = self.settings()
         if self.poses is not None:
@@ -131,12 +118,10 @@ class Trainer:
         return loss, self.scene.drawn[index].name
 
     def _rests(self, index: int) -> bool:
-        """Whether this step's view has converged and is left out; only once the set of Gaussians is settled, and never
-        with guidance, which counts the steps it is asked for."""
-        config = self.config
-        settled = max(schedule.refine_stop(config.density, config.iterations), *self._coarse_until, 0)
-        wanted = config.schedule.rest_converged and self._guidance is None
-        return wanted and self.step > settled and self._resting.skips(index)
+        """True when this step's view has converged and is left out; only once the set of Gaussians is settled, and
+        never with guidance, which counts the steps it is called for."""
+        wanted = self.plan.rest_converged and self._guidance is None
+        return wanted and self._schedule.is_settled(self.step) and self._resting.skips(index)
 
     def _passed(self, index: int) -> tuple[float, str]:
         """A step that computes nothing: its view's last loss, and its name."""
@@ -146,80 +131,72 @@ class Trainer:
         return loss, self.scene.drawn[index].name
 
     def settings(self) -> RasterSettings:
-        """How the current step draws."""
-        degree = schedule.sh_degree(self.step, self.config.optimizer, self._max_sh_degree)
-        if self.config.schedule.bands == "residual":
-            degree = self._bands.degree
-        return RasterSettings(sh_degree=degree, antialiased=self.config.antialiased)
-
-    def _random_background(self) -> Float[Tensor, "3"]:
-        return torch.rand(3, generator=self._generators["background"])
+        """The rasterizer's settings for the current step."""
+        degree = self._bands.degree if self.plan.residual_bands else self._schedule.sh_degree(self.step)
+        return RasterSettings(sh_degree=degree, antialiased=self.plan.antialiased)
 
     def _gradients(
         self, target: Target, background: Float[Tensor, "3"], settings: RasterSettings
     ) -> tuple[float, Gradients]:
-        """Forward, loss, backward, regularisers; density control takes note."""
+        """Forward, loss, backward, regularizers; density control takes note."""
+        weights = self.plan.weights
         dropout = self._dropout()
         drawn = self.model.gaussians if dropout is None else dropout.drawn
         frame = self.backend.forward(drawn, target.camera, settings, background)
-        photometric = self.backend.photometric(frame.colors, target.colors, self.config.loss.lambda_dssim)
+        photometric = self.backend.photometric(frame.colors, target.colors, weights.dssim)
         v_alphas = None
-        if self._weights.alpha > 0 and target.alphas is not None:
-            v_alphas = alpha_gradient(frame.alphas, target.alphas, self._weights.alpha * target.share)
+        if weights.alpha > 0 and target.alphas is not None:
+            v_alphas = alpha_gradient(frame.alphas, target.alphas, weights.alpha * target.share)
         weight = target.share * target.color
         v_colors = photometric.v_colors if weight == 1 else photometric.v_colors.mul_(weight)
-        bands = self._guidance is not None and self._guidance.guide.is_due(self.step)  # which adds its own to them
+        bands = self._guidance is not None and self._guidance.is_due(self.step)  # which adds its own to them
         absgrad = self._wants_absgrad()
         gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=absgrad, bands=bands, into=self._spent)
         self._spent = gradients
         self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])
-        if self.config.schedule.bands == "residual" and self._bands.watches(self.step):
+        if self.plan.residual_bands and self._bands.watches(self.step):
             self._bands.note(self.model.gaussians, target.camera, gradients)
         loss = photometric.loss * weight
         if target.color == 1:
-            self._show(loss, frame.colors, target)
+            self._update_means(loss, frame.colors, target)
         return loss, self._regularized(gradients, dropout)
 
     def _wants_absgrad(self) -> bool:
-        """Whether adc will read absolute gradients of this step."""
-        density = self.config.density
-        wanted = density.absgrad and density.strategy == "adc"
-        return wanted and self.step <= schedule.refine_stop(density, self.config.iterations)
+        """True when adc will read absolute gradients of this step."""
+        density = self.plan.density
+        return density.absgrad and density.strategy == "adc" and self.step <= self._schedule.refine_stop
 
     def _dropout(self) -> Dropout | None:
         """With few views a step draws a random part of the Gaussians."""
-        rate = schedule.dropout(self.step, self.config.iterations, self.config) if self._sparse else 0.0
+        rate = self._schedule.dropout(self.step)
         return Dropout.of(self.model.gaussians, rate, self._generators["dropout"]) if rate > 0 else None
 
     def _regularized(self, gradients: Gradients, dropout: Dropout | None) -> Gradients:
-        """With respect to the stored parameters, terms beside the photometric loss included."""
-        gaussians = self.model.gaussians
+        """Gradients of the stored parameters, terms beside the photometric loss included."""
+        gaussians, weights = self.model.gaussians, self.plan.weights
         if dropout is not None:
             gradients.logit_opacities.mul_(dropout.slope)
-        if self._weights.opacity > 0:
-            add_opacity_gradient(gradients.logit_opacities, gaussians.logit_opacities, self._weights.opacity)
-        if self._weights.scale > 0:
-            add_scale_gradient(gradients.log_scales, gaussians.log_scales, self._weights.scale)
+        if weights.opacity > 0:
+            add_opacity_gradient(gradients.logit_opacities, gaussians.logit_opacities, weights.opacity)
+        if weights.scale > 0:
+            add_scale_gradient(gradients.log_scales, gaussians.log_scales, weights.scale)
         return gradients
 
     def _update(self, gradients: Gradients, camera: Cameras, settings: RasterSettings) -> None:
         """Adam, then what density control adds to a step."""
-        config = self.config.optimizer
-        share = schedule.lr_share(self.step, self._last, self._settling, config)
-        lr_means = share * schedule.lr_means(self.step, self.config.iterations, config, self._extent)
-        rates = learning_rates(config, lr_means, share)
-        adam_step(self.model, gradients, rates, config, self.backend, camera, settings)
-        self._density.after_step(self.model, lr_means)
+        rates = self._schedule.learning_rates(self.step, self._last)
+        adam_step(self.model, gradients, rates, self._schedule.optimizer, self.backend, camera, settings)
+        self._density.after_step(self.model, rates["means"])
 
     def _change_set(self) -> None:
         """Add, remove and reorder Gaussians where this step asks for it, and take the next band when it is due."""
-        if self.config.schedule.bands == "residual":
+        if self.plan.residual_bands:
             self._bands.decide(self.step)
         refined = self._density.refine(self.step, self.model)
         moved = refined is not self.model
         self.model = refined
-        if self._sparse and schedule.prunes_floaters(self.step, self.config.iterations, self.config):
-            sigmas = schedule.floater_sigmas(self.step, self.config.iterations)
+        if self._schedule.prunes_floaters(self.step):
+            sigmas = self._schedule.floater_sigmas(self.step)
             gaussians = self.model.gaussians
             self._select(at_least_one(~solitary(gaussians.means, sigmas), gaussians.logit_opacities))
             moved = True
@@ -233,35 +210,29 @@ class Trainer:
         self.model = self.model.select(rows)
         self._density.select(rows)
 
-    def _show(self, loss: float, rendered: Float[Tensor, "H W 3"], target: Target) -> None:
-        shown = self.shown
-        shown.loss = loss if shown.loss is None else (1 - NEWS) * shown.loss + NEWS * loss
+    def _update_means(self, loss: float, rendered: Float[Tensor, "H W 3"], target: Target) -> None:
+        means, share = self.means, NEW_VALUE_SHARE
+        means.loss = loss if means.loss is None else (1 - share) * means.loss + share * loss
         if self.step % PSNR_EVERY == 1:
             mse = target.share * float(torch.nn.functional.mse_loss(rendered, target.colors))
-            shown.mse = mse if shown.mse is None else (1 - NEWS) * shown.mse + NEWS * mse
+            means.mse = mse if means.mse is None else (1 - share) * means.mse + share * mse
 
     @property
-    def finished_early(self) -> bool:
-        """Whether the run is over though its iterations are not."""
-        return self._last <= self.step < self.config.iterations
+    def finished(self) -> bool:
+        """True when the run is over, by its steps or by a flat loss."""
+        return self.step >= self._last
 
     def _end_when_flat(self, loss: float) -> None:
         """Let the run settle and end once its loss is flat; counts only after the last refinement and band."""
-        config = self.config
-        if not config.schedule.stop_when_flat or self._last < config.iterations:
+        iterations = self._schedule.iterations
+        if not self.plan.stop_when_flat or self._last < iterations:
             return
-        settled = max(
-            schedule.refine_stop(config.density, config.iterations),
-            self._max_sh_degree * config.optimizer.sh_degree_every,
-            *self._coarse_until,
-            0,
-        )
-        if self.step > settled and self._flatness.update(loss):
-            self._last = min(config.iterations, self.step + self._settling)
+        if self._schedule.is_complete(self.step) and self._flatness.update(loss):
+            self._last = min(iterations, self.step + self._schedule.settling)
 
     @staticmethod
     def resumed(
-        config: TrainConfig,
+        plan: RunPlan,
         scene: Scene,
         backend: Backend,
         checkpoint: Checkpoint,
@@ -269,7 +240,7 @@ class Trainer:
     ) -> Trainer:
         """A trainer as it was when the checkpoint was written; InputError when that belongs to another run."""
         try:
-            trainer = Trainer(config, scene, _record(checkpoint.tensors, "gaussians"), backend, guidance)
+            trainer = Trainer(plan, scene, _record(checkpoint.tensors, "gaussians"), backend, guidance)
             trainer._restore(checkpoint.tensors, checkpoint.meta)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(
@@ -291,7 +262,7 @@ class Trainer:
             "epoch_position": self._order.position,
             "flatness": {field.name: getattr(self._flatness, field.name) for field in fields(self._flatness)},
             "last": self._last,
-            "shown": {"loss": self.shown.loss, "mse": self.shown.mse},
+            "shown": {"loss": self.means.loss, "mse": self.means.mse},
         }
         if self._guidance is not None:
             guiding, meta["guidance"] = self._guidance.state()
@@ -317,9 +288,9 @@ class Trainer:
         for name, generator in self._generators.items():
             generator.set_state(tensors[f"rng.{name}"])
         self._order.restore(tensors["epoch.order"], int(meta["epoch_position"]))
-        self._flatness = schedule.Flatness(**meta["flatness"])
+        self._flatness = Flatness(**meta["flatness"])
         self._last = int(meta["last"])
-        self.shown = Shown(**meta["shown"])
+        self.means = RunningMeans(**meta["shown"])
         self.step = int(meta["step"])
 
 

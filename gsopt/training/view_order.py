@@ -24,7 +24,7 @@ class ViewOrder:
         self.order = torch.empty(0, dtype=torch.int64)
         """This epoch's views."""
         self.position = 0
-        """How many of them were seen."""
+        """Number of them that were seen."""
 
     def next(self) -> int:
         """The view of the next step."""

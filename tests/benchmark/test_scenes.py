@@ -15,7 +15,7 @@ from gsopt.cli import bench
 from gsopt.config.presets import PRESETS
 from gsopt.config.train import DataConfig
 from gsopt.errors import InputError, UsageError
-from gsopt.training.schedule import shortened
+from gsopt.training.plan import shortened
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +89,8 @@ def test_a_task_with_a_length_or_a_budget_belongs_to_the_grid() -> None:
     assert Task("a", data, "high").kind == "curve"
     assert Task("a", data, iterations=5).kind == Task("a", data, max_gaussians=5).kind == "grid"
     assert Task("a", data, "high").config().iterations == PRESETS["high"]["iterations"]
-    one_view = shortened(Task("a", data, iterations=6000).config(), 1)
-    assert one_view.iterations == 6000  # a point of the grid is as long as its record says
+    steps = shortened(Task("a", data, iterations=6000).config(), 1)
+    assert steps == 6000  # a point of the grid is as long as its record says
 
 
 def test_times_lie_between_two_events() -> None:

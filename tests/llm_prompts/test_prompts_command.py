@@ -15,11 +15,10 @@ from tiny_scenes import write_dataset
 
 from gsopt import cli
 from gsopt.cli.train import Guidance, guidance_config
-from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError
 from gsopt.llm_prompts.review import Abandoned, edited, review
 from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, read_set, write_set
-from gsopt.training.guided.session import reference_paths
+from gsopt.training.guided.references import reference_paths
 
 NOTES = ["--notes", "femur, osteoporotic, CT", "--domain", "medicine"]
 HEAVY = {"torch", "numpy", "PIL", "pydantic", "tokenizers", "transformers", "diffusers", "urllib.request"}
@@ -149,9 +148,9 @@ def test_training_reads_the_prompts_and_the_pictures_that_were_accepted(tmp_path
     flags = Guidance(prompts=str(tmp_path / "prompts.json"), prior="a/b", ref_image=("mine.png",))
     config = guidance_config(flags)
     accepted = str(tmp_path / "prompts-images" / "001.png")
-    assert reference_paths(TrainConfig(guidance=config)) == ("mine.png", accepted)
+    assert reference_paths(config) == ("mine.png", accepted)
     old = replace(config, ref_image=("mine.png", accepted))  # a run of gsopt 0.1.0 recorded both
-    assert reference_paths(TrainConfig(guidance=old)) == ("mine.png", accepted)
+    assert reference_paths(old) == ("mine.png", accepted)
     assert config.prompts == str(tmp_path / "prompts.json")
 
 

@@ -17,7 +17,7 @@ from tensor_meter import Meter, Phase
 
 from gsopt.cli import main
 from gsopt.raster.backend import Gradients
-from gsopt.sds.guidance_step import Guide
+from gsopt.sds.guidance_step import Guidance
 from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
 FLAGS = [
@@ -81,9 +81,9 @@ def _watch(patch: pytest.MonkeyPatch, meter: Meter, seen: Step) -> None:
     measured(DiffusersPrior, "decode", vae)
     measured(DiffusersPrior, "denoise", unet)
     measured(torch.autograd, "grad", lambda *_: None)
-    inner = Guide.gradients
+    inner = Guidance.gradients
 
-    def gradients(self: Guide, *args: Any) -> Gradients | None:
+    def gradients(self: Guidance, *args: Any) -> Gradients | None:
         began = time.process_time()
         found = inner(self, *args)
         if found is not None:
@@ -91,7 +91,7 @@ def _watch(patch: pytest.MonkeyPatch, meter: Meter, seen: Step) -> None:
             seen.gradients.append(found)
         return found
 
-    patch.setattr(Guide, "gradients", gradients)
+    patch.setattr(Guidance, "gradients", gradients)
 
 
 def size(network: torch.nn.Module) -> int:

@@ -11,11 +11,13 @@ import pytest
 import torch
 
 from gsopt.config.guidance import GuidanceConfig
+from gsopt.data.background import Background
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.raster.api import make_backend
-from gsopt.sds import coverage, schedule
+from gsopt.sds import coverage
 from gsopt.sds.candidate_views import AZIMUTHS, HIGHEST, LOWEST, draw_candidate, guidance_cameras, nearest, square
+from gsopt.sds.guidance_plan import GuidancePlan
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.protocol import References
 
@@ -205,10 +207,14 @@ def test_the_nearest_references_come_first() -> None:
 CONFIG = GuidanceConfig(start=0.25, stop=0.75, every=10, t_max=0.7, t_max_end=0.25)
 
 
+def resolved(config: GuidanceConfig, iterations: int = 400) -> GuidancePlan:
+    return GuidancePlan.of(config, iterations, 0, Background(), view_conditioned=False)
+
+
 def test_guided_steps_lie_after_the_warm_up_and_every_kth() -> None:
-    guided = [step for step in range(1, 401) if schedule.is_guided(step, CONFIG, 400)]
+    guided = [step for step in range(1, 401) if resolved(CONFIG).is_guided(step)]
     assert guided == list(range(100, 301, 10))
-    assert schedule.guided_steps(CONFIG, 400) == len(guided)
+    assert resolved(CONFIG).guided_steps == len(guided)
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 3, 17, 400])
@@ -216,17 +222,16 @@ def test_guided_steps_lie_after_the_warm_up_and_every_kth() -> None:
     "config", [CONFIG, replace(CONFIG, start=0.0, stop=1.0, every=1), replace(CONFIG, start=1.0, stop=1.0)]
 )
 def test_the_number_of_guided_steps_is_what_the_schedule_counts(config: GuidanceConfig, iterations: int) -> None:
-    counted = sum(schedule.is_guided(step, config, iterations) for step in range(1, iterations + 1))
-    assert schedule.guided_steps(config, iterations) == counted
+    plan = resolved(config, iterations)
+    assert plan.guided_steps == sum(plan.is_guided(step) for step in range(1, iterations + 1))
 
 
 @pytest.mark.parametrize("anneal", ["sqrt", "linear"])
 def test_the_most_noise_falls_from_first_to_last(anneal) -> None:
-    config = replace(CONFIG, anneal=anneal)
-    most = [schedule.noise_range(step, config, 400)[1] for step in range(100, 301, 10)]
+    plan = resolved(replace(CONFIG, anneal=anneal))
+    most = [plan.noise_range(step)[1] for step in range(100, 301, 10)]
     assert (most[0], most[-1]) == (pytest.approx(0.7), pytest.approx(0.25))
     assert all(later < before for before, later in itertools.pairwise(most))
-    assert {schedule.noise_range(step, config, 400)[0] for step in (100, 300)} == {0.02}
-    assert schedule.noise_range(200, replace(CONFIG, anneal="sqrt"), 400) < schedule.noise_range(
-        200, replace(CONFIG, anneal="linear"), 400
-    )
+    assert {plan.noise_range(step)[0] for step in (100, 300)} == {0.02}
+    early, even = (resolved(replace(CONFIG, anneal=kind)).noise_range(200) for kind in ("sqrt", "linear"))
+    assert early < even

@@ -11,6 +11,7 @@ import torch
 from priors import PixelPrior, gaussian_posterior, knows
 
 from gsopt.config.guidance import GuidanceConfig
+from gsopt.data.background import Background
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
@@ -20,7 +21,9 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.sds import policies
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.guidance_step import MAX_FAILURES, Guide, ObservedRender
+from gsopt.sds.guidance_plan import GuidancePlans
+from gsopt.sds.guidance_step import MAX_FAILURES, Guidance, GuidanceSetup
+from gsopt.sds.observed_render import ObservedRender
 
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)
@@ -72,11 +75,12 @@ def blobs(count: int = 30, seed: int = 0) -> Gaussians:
     )
 
 
-def guide(prior: PixelPrior, config: GuidanceConfig = ALWAYS, words: Conditioning = NO_WORDS, **changes) -> Guide:
-    settings = {"weight": 0.2, "iterations": 100, "seed": 0, "background": torch.ones(3), "warn": [].append, **changes}
+def guide(prior: PixelPrior, config: GuidanceConfig = ALWAYS, words: Conditioning = NO_WORDS, **changes) -> Guidance:
+    settings = {"weight": 0.2, "iterations": 100, "seed": 0, "background": Background(), "warn": [].append, **changes}
     inputs = settings.pop("scene", scene(0, 40, 80))
-    front = inputs.train[0].camera
-    return Guide(prior, words, config, inputs, BACKEND, front=front, **settings)
+    setup = GuidanceSetup(prior, words, inputs.train[0].camera, settings["weight"], settings["warn"])
+    plans = GuidancePlans.of(config, settings["iterations"], settings["seed"], settings["background"])
+    return setup.on(inputs, BACKEND, plans)
 
 
 def toy(**changes) -> PixelPrior:
@@ -88,16 +92,15 @@ def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
     guided, gaussians = guide(toy(), replace(ALWAYS, certain_weight=0.25)), blobs()
     found = guided.gradients(7, gaussians, SETTINGS)
     assert found is not None
-    sample = guided.sample
+    sample = guided.last
     assert sample is not None
-    camera = guided.cameras.camera(sample.view, guided._random(7, sample.view, "jitter"))
+    camera = guided.observer.cameras.camera(sample.view, guided._random(7, sample.view, "jitter"))
 
     def z_of(sh0: torch.Tensor) -> torch.Tensor:
         colors = BACKEND.forward(replace(gaussians, sh0=sh0), camera, SETTINGS, torch.ones(3)).colors
         return (2 * colors.permute(2, 0, 1)[None] - 1).double()
 
     z, alphas = z_of(gaussians.sh0), BACKEND.forward(gaussians, camera, SETTINGS, torch.ones(3)).alphas
-    assert sample.x0 is not None
     seen = ObservedRender(camera, (z.float() + 1) / 2, alphas, sample.uncertainty)
     _, noise = guided._noise_sample(7, sample.view, seen, z.float())
     weights = (0.25 * alphas + 0.75 * sample.uncertainty).double()
@@ -115,15 +118,15 @@ def test_steps_towards_a_prior_that_knows_the_answer_reach_it(policy) -> None:
     """Descent on the colors of what is uncertain brings the render to the prior's image, whatever the policy."""
     target = torch.tensor([0.6, -0.2, 0.1]).view(3, 1, 1).expand(3, SIZE, SIZE)
     config = replace(ALWAYS, policy=policy, weighting="x0", refresh_every=1, inversion_steps=2, denoise_steps=2)
-    background = (target[:, 0, 0] + 1) / 2
+    background = Background(tuple(((target[:, 0, 0] + 1) / 2).tolist()))
     guided = guide(PixelPrior(knows(target), size=SIZE), config, background=background, iterations=120)
     gaussians, rate = blobs(), 1000 if policy == "recon" else 3000  # recon's loss is a mean over the subject alone
     distances = []
     for step in range(1, 121):
         found = guided.gradients(step, gaussians, SETTINGS)
         assert found is not None
-        assert guided.sample is not None
-        distances.append(float((2 * guided.sample.render - 1 - target).abs().mean()))
+        assert guided.last is not None
+        distances.append(float((2 * guided.last.render - 1 - target).abs().mean()))
         gaussians = replace(gaussians, sh0=gaussians.sh0 - rate * found.sh0)
     assert sum(distances[-5:]) < 0.25 * sum(distances[:5])
 
@@ -152,7 +155,7 @@ def test_empty_surroundings_do_not_weaken_a_target() -> None:
         side = SIZE + 2 * border
         asked, target = torch.full((3, side, side), 255), torch.zeros(3, side, side)
         guided.memory.targets[0], guided.memory.target_steps[0] = torch.stack([asked, target]).to(torch.uint8), 1
-        seen = ObservedRender(guided.cameras.camera(0), torch.ones(1, 3, side, side), known, free)
+        seen = ObservedRender(guided.observer.cameras.camera(0), torch.ones(1, 3, side, side), known, free)
         pulls.append(guided.image_gradient(1, 0, seen)[0, 0, border : side - border, border : side - border])
     torch.testing.assert_close(pulls[1], pulls[0])
     each = 1 / (3 * 8 * 8)  # dL/dx of a channel of one of the subject's pixels, where nothing is known
@@ -173,14 +176,14 @@ def test_lambda_scales_the_gradient_and_nothing_else(policy) -> None:
 
 def test_a_kept_target_stands_on_the_background_of_the_render_it_is_compared_with() -> None:
     """With random backgrounds too: of an unchanged scene, a candidate's render is the same in every step."""
-    guided = guide(toy(), replace(ALWAYS, policy="recon", refresh_every=1000), background=None)
+    guided = guide(toy(), replace(ALWAYS, policy="recon", refresh_every=1000), background=Background(random=True))
     renders: dict[int, torch.Tensor] = {}
     met = 0
     for step in range(1, 200):
         guided.gradients(step, blobs(), SETTINGS)
-        assert guided.sample is not None
-        met += guided.sample.view in renders
-        assert torch.equal(renders.setdefault(guided.sample.view, guided.sample.render), guided.sample.render)
+        assert guided.last is not None
+        met += guided.last.view in renders
+        assert torch.equal(renders.setdefault(guided.last.view, guided.last.render), guided.last.render)
     assert met > 10
     assert len({float(render[0, 0, 0]) for render in renders.values()}) > 10
 
@@ -211,7 +214,7 @@ def test_what_all_inputs_see_is_left_alone() -> None:
     around = scene(*range(0, 360, 30))
     guided = guide(prior, replace(ALWAYS, min_uncertainty=0.6), scene=around)
     assert [guided.gradients(step, blobs(), SETTINGS) for step in range(1, 6)] == [None] * 5
-    assert (guided.counts.decided, guided.counts.guided, prior.calls) == (5, 0, [])
+    assert (guided.memory.counts.decided, guided.memory.counts.guided, prior.calls) == (5, 0, [])
 
 
 def test_uncertain_views_are_drawn_more_often() -> None:
@@ -230,8 +233,8 @@ def test_uncertain_views_are_drawn_more_often() -> None:
     behind = 0
     for step in range(1, 61):
         assert guided.gradients(step, gaussians, SETTINGS) is not None
-        assert guided.sample is not None
-        behind += bool(guided.cameras.candidates.centers[guided.sample.view, 0] < 0)
+        assert guided.last is not None
+        behind += bool(guided.observer.cameras.candidates.centers[guided.last.view, 0] < 0)
     assert behind > 30  # more than half
 
 
@@ -244,12 +247,12 @@ def test_the_prior_is_told_everything_about_the_view() -> None:
     guided = guide(prior, config, words)
     guided.gradients(4, blobs(), SETTINGS)
     positive, negative = prior.seen
-    sample = guided.sample
+    sample = guided.last
     assert sample is not None
     assert positive.render is not None
     assert positive.render.shape == (4, SIZE, SIZE)
     torch.testing.assert_close(positive.render[:3], sample.render.clamp(0, 1))
-    camera = guided.cameras.camera(sample.view, guided._random(4, sample.view, "jitter"))
+    camera = guided.observer.cameras.camera(sample.view, guided._random(4, sample.view, "jitter"))
     assert positive.camera is not None
     assert torch.equal(positive.camera.viewmats, camera.viewmats)
     assert positive.references is not None
@@ -273,21 +276,20 @@ def test_a_view_conditioned_prior_can_use_its_references() -> None:
 
     guided = guide(PixelPrior(answer, size=SIZE), replace(ALWAYS, weighting="x0"))
     assert guided.gradients(4, blobs(), SETTINGS) is not None
-    assert guided.sample is not None
-    assert guided.sample.x0 is not None
-    camera = guided.cameras.camera(guided.sample.view, guided._random(4, guided.sample.view, "jitter"))
-    closest = int((guided.references.cameras.forwards @ camera.forwards[0]).argmax())
-    assert len({float(image.mean()) for image in guided.references.images}) == 3
-    torch.testing.assert_close(guided.sample.x0[0], 2 * guided.references.images[closest] - 1)
+    assert guided.last is not None
+    camera = guided.observer.cameras.camera(guided.last.view, guided._random(4, guided.last.view, "jitter"))
+    closest = int((guided.observer.references.cameras.forwards @ camera.forwards[0]).argmax())
+    assert len({float(image.mean()) for image in guided.observer.references.images}) == 3
+    torch.testing.assert_close(guided.last.estimate[0], 2 * guided.observer.references.images[closest] - 1)
 
 
 def test_a_cached_target_is_used_until_it_is_too_old_and_survives_a_checkpoint() -> None:
     prior = toy()
     config = replace(ALWAYS, policy="recon", refresh_every=10, denoise_steps=3)
     guided = guide(prior, config)
-    guided._look_around(1, blobs())
-    guided.memory.mean_u = torch.zeros(36)
-    guided.memory.mean_u[5] = 1.0  # always the same candidate
+    known = guided.observer.coverage(1, blobs())
+    always_the_same = torch.nn.functional.one_hot(torch.tensor(5), 36).float()
+    guided.memory.coverage = replace(known, mean_u=always_the_same)
     calls = []
     for step in (1, 2, 10, 11, 12):
         before = len(prior.calls)
@@ -309,7 +311,7 @@ def test_a_prior_that_fails_costs_the_step_then_the_guidance_never_the_run(polic
     prior = PixelPrior(lambda x_t, a, c: torch.full_like(x_t, math.nan), size=SIZE, name="broken")
     guided = guide(prior, replace(ALWAYS, policy=policy), warn=told.append)
     assert [guided.gradients(step, blobs(), SETTINGS) for step in range(1, 9)] == [None] * 8
-    assert (guided.counts.failed, guided.counts.ended) == (MAX_FAILURES, True)
+    assert (guided.memory.counts.failed, guided.memory.counts.ended) == (MAX_FAILURES, True)
     assert len(told) == MAX_FAILURES
     assert "broken" in told[0]
     assert "without guidance" in told[-1]
@@ -322,7 +324,7 @@ def test_one_failure_is_forgiven() -> None:
     guided = guide(prior)
     found = [guided.gradients(step, blobs(), SETTINGS) is not None for step in range(1, 6)]
     assert found == [True, False, True, True, True]
-    assert (guided.counts.guided, guided.counts.failed, guided.counts.failed_in_a_row) == (4, 1, 0)
+    assert (guided.memory.counts.guided, guided.memory.counts.failed, guided.memory.counts.failed_in_a_row) == (4, 1, 0)
 
 
 def test_too_little_memory_is_a_failure_of_the_step() -> None:
@@ -350,7 +352,7 @@ def test_state_and_restore_continue_with_the_same_bits() -> None:
     assert two is not None
     for name in PARAMETERS:
         assert torch.equal(getattr(one, name), getattr(two, name))
-    assert other.counts == guided.counts
+    assert other.memory.counts == guided.memory.counts
 
 
 def test_the_set_of_gaussians_may_change_between_steps() -> None:
@@ -359,4 +361,4 @@ def test_the_set_of_gaussians_may_change_between_steps() -> None:
     guided.forget()
     assert guided.gradients(2, blobs(40), SETTINGS) is not None
     assert guided.memory.coverage is not None
-    assert len(guided.memory.coverage) == 40
+    assert len(guided.memory.coverage.covered) == 40

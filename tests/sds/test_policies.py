@@ -8,9 +8,11 @@ import pytest
 import torch
 from priors import NOBODY, PixelPrior, cosine_schedule, gaussian_posterior, knows, scale
 
-from gsopt.config.guidance import GuidanceConfig, settled
+from gsopt.config.guidance import GuidanceConfig
+from gsopt.data.background import Background
 from gsopt.errors import InputError, NumericalError
 from gsopt.sds import policies
+from gsopt.sds.guidance_plan import GuidancePlan
 from gsopt.sds.noise import PREDICTIONS, NoiseSchedule, add_noise, eps_from, generator, output_for, weight, x0_from
 from gsopt.sds.policies import NoiseSample
 from gsopt.sds.priors.protocol import Condition, Pair, guided_x0
@@ -276,13 +278,18 @@ def test_an_old_target_pulls_only_where_and_as_far_as_the_prior_wanted() -> None
     assert float(found[3]) == pytest.approx(0.5, abs=1e-5)
 
 
-def test_what_is_left_open_is_settled_by_the_kind_of_prior_and_what_was_said_stays() -> None:
-    view, text = (settled(GuidanceConfig(), view_conditioned=kind) for kind in (True, False))
+def test_what_is_left_open_is_resolved_by_the_kind_of_prior_and_what_is_given_stays() -> None:
+    def resolved(config: GuidanceConfig, kind: bool) -> GuidancePlan:
+        return GuidancePlan.of(config, 1000, 0, Background(), view_conditioned=kind)
+
+    view, text = (resolved(GuidanceConfig(), kind) for kind in (True, False))
     assert (view.policy, view.every, view.guidance_scale, view.denoise_steps) == ("recon", 2, 1.0, 1)
     assert (text.policy, text.every, text.guidance_scale, text.denoise_steps) == ("sds", 10, 3.0, 5)
     assert (view.min_uncertainty, view.certain_weight) == (0.0, 1.0)
     assert (text.min_uncertainty, text.certain_weight) == (0.05, 0.0)
-    said = GuidanceConfig(
+    given = GuidanceConfig(
         policy="sds", every=7, guidance_scale=5.0, denoise_steps=3, min_uncertainty=0.1, certain_weight=0.3
     )
-    assert settled(said, view_conditioned=True) == said
+    names = ("policy", "every", "guidance_scale", "denoise_steps", "min_uncertainty", "certain_weight")
+    for kind in (True, False):
+        assert [getattr(resolved(given, kind), name) for name in names] == [getattr(given, name) for name in names]

@@ -9,24 +9,31 @@ import torch
 from tiny_scenes import cloud
 from torch import Tensor
 
-from gsopt.config.train import DensityConfig
+from gsopt.config.train import DensityConfig, TrainConfig
 from gsopt.gaussians import Gaussians
 from gsopt.raster.backend import Gradients
 from gsopt.training.density import at_least_one
 from gsopt.training.density.adc import SPLIT_SHRINK, Adc, best, split
 from gsopt.training.optimizer import OptimizedGaussians
+from gsopt.training.plan import DensityPlan, density_plan, make_schedule
+from gsopt.training.schedule import Schedule
 
 EXTENT = 2.0
 CONFIG = DensityConfig(refine_start=0, refine_every=10, refine_stop=100, grow_grad2d=1e-3, reset_every=50)
 ITERATIONS = 10_000
 
 
+def plan_of(config: DensityConfig) -> tuple[DensityPlan, Schedule]:
+    schedule = make_schedule(TrainConfig(density=config), ITERATIONS, sparse=False, extent=EXTENT)
+    return density_plan(config, config.max_gaussians or 10**6, EXTENT), schedule
+
+
 def controlled(model: OptimizedGaussians, config: DensityConfig = CONFIG) -> Adc:
-    return Adc(config, ITERATIONS, EXTENT, len(model), torch.Generator().manual_seed(0))
+    return Adc(*plan_of(config), len(model), torch.Generator().manual_seed(0))
 
 
 def pulled(count: int, rows: Tensor, strength: float = 1.0, absolute: bool = False) -> Gradients:
-    """Gradients of the projected centres that lie on `rows` only."""
+    """Gradients of the projected centers that lie on `rows` only."""
     v = torch.zeros(count, 2)
     v[rows, 0] = strength
     nothing = dict.fromkeys(("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"), torch.empty(0))
@@ -53,7 +60,7 @@ def seen(count: int) -> Tensor:
 SMALL, LARGE = 0.5 * CONFIG.grow_scale3d * EXTENT, 2 * CONFIG.grow_scale3d * EXTENT
 
 
-def test_statistics_are_the_mean_norm_in_normalised_device_coordinates() -> None:
+def test_statistics_are_the_mean_norm_in_normalized_device_coordinates() -> None:
     model = OptimizedGaussians.start(cloud(3, seed=1))
     density = controlled(model)
     radii = torch.tensor([[2, 2], [3, 3], [0, 0]], dtype=torch.int32)

@@ -28,7 +28,7 @@ def test_where_nothing_stands_out_nothing_is_found() -> None:
     assert not solitary(means, sigmas=2.0).any()
 
 
-@pytest.mark.parametrize("count", [0, 1, floaters.FEWEST - 1])
+@pytest.mark.parametrize("count", [0, 1, floaters.MIN_GAUSSIANS - 1])
 def test_few_gaussians_have_no_floaters(count: int) -> None:
     means = 100 * blob(count)
     assert not solitary(means, sigmas=0.0).any()
@@ -45,7 +45,7 @@ def test_distances_are_those_to_the_nearest_others() -> None:
 def test_a_sample_of_references_gives_about_the_same_distances(monkeypatch: pytest.MonkeyPatch) -> None:
     means = blob(3000)
     sampled = neighbor_distances(means)
-    monkeypatch.setattr(floaters, "MOST_REFERENCES", len(means))
+    monkeypatch.setattr(floaters, "MAX_REFERENCES", len(means))
     exact = neighbor_distances(means)
     assert float((sampled / exact).log().mean().abs()) < 0.1
     assert torch.corrcoef(torch.stack([sampled.log(), exact.log()]))[0, 1] > 0.9

@@ -22,6 +22,7 @@ from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.priors.protocol import Condition
 from gsopt.training.guided import start
 from gsopt.training.loop import train
+from gsopt.training.plan import RunPlan
 from gsopt.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sds"))
@@ -208,3 +209,38 @@ def test_words_of_a_run_that_was_broken_off_do_not_guide_the_next_one(
     train(config(dataset, prompt=("a dog",)), tmp_path / "run")
     folder = tmp_path / "run" / "guidance"
     assert [prompt.text for prompt in Conditioning.load(folder / "conditioning.safetensors").prompts] == ["a dog"]
+
+
+def test_a_run_that_is_stopped_while_the_guard_works_ends_at_step_0_and_can_be_resumed(
+    dataset: Path, tmp_path: Path, prior: PixelPrior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guided = config(dataset, guard_views=1, guard_steps=20)
+    original = start.evaluate_guidance
+
+    def evaluate(*args):
+        (tmp_path / "run" / "stop").touch()
+        return original(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(start, "evaluate_guidance", evaluate)
+        assert train(guided, tmp_path / "run").stopped
+    last = read_events(tmp_path / "run" / "events.jsonl")[0][-1]
+    assert (last["kind"], last["step"]) == ("stopped", 0)
+    train(guided, tmp_path / "run", resume=True)
+    train(guided, tmp_path / "whole")
+    whole, resumed = ((tmp_path / name / "splat.ply").read_bytes() for name in ("whole", "run"))
+    assert whole == resumed
+
+
+def test_the_resolved_plan_stands_in_config_json(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
+    train(config(dataset), tmp_path / "run")
+    document = json.loads((tmp_path / "run" / "config.json").read_text())
+    plan = RunPlan.of(config(dataset), load_scene(DataConfig(path=str(dataset))))
+    assert document["plan"] == plan.to_dict()
+    assert None not in _leaves(document["plan"])
+
+
+def _leaves(value: object) -> list[object]:
+    if isinstance(value, dict):
+        value = list(value.values())
+    return [leaf for item in value for leaf in _leaves(item)] if isinstance(value, list) else [value]

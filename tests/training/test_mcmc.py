@@ -11,16 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scenes import cloud
 
-from gsopt.config.train import DensityConfig
+from gsopt.config.train import DensityConfig, TrainConfig
 from gsopt.raster.reference import covariances
 from gsopt.training.density.mcmc import Mcmc, draw, shared, spread
 from gsopt.training.optimizer import OptimizedGaussians
+from gsopt.training.plan import density_plan, make_schedule
 
 CONFIG = DensityConfig(strategy="mcmc", refine_start=0, refine_every=10, refine_stop=100, max_gaussians=60)
 
 
 def controlled(config: DensityConfig = CONFIG) -> Mcmc:
-    return Mcmc(config, 1000, torch.Generator().manual_seed(0))
+    schedule = make_schedule(TrainConfig(density=config), 1000, sparse=False, extent=1.0)
+    return Mcmc(density_plan(config, config.max_gaussians or 10**6, 1.0), schedule, torch.Generator().manual_seed(0))
 
 
 def paper_factor(opacity: float, n: int) -> float:

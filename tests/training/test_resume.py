@@ -22,11 +22,13 @@ from gsopt.config.train import (
     SparseConfig,
     TrainConfig,
 )
+from gsopt.data.scene import load_scene
 from gsopt.errors import UsageError
 from gsopt.events import read_events
-from gsopt.training import loop, schedule
 from gsopt.training.checkpoint import read_checkpoint, saved
 from gsopt.training.loop import train
+from gsopt.training.plan import RunPlan
+from gsopt.training.schedule import Flatness
 from gsopt.training.trainer import Trainer
 
 KILLED_RUN = Path(__file__).with_name("killed_run.py")
@@ -241,7 +243,7 @@ def test_a_second_interrupt_does_not_wait(dataset: Path, tmp_path: Path, monkeyp
 
 
 def test_early_end_is_remembered(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop.schedule.Flatness, "update", lambda self, loss: True)
+    monkeypatch.setattr(Flatness, "update", lambda self, loss: True)
     config = replace(configs(dataset)["coarse to fine"], optimizer=replace(tiny_config(dataset).optimizer, sh_degree=0))
     first = train(config, tmp_path / "run")
     assert first.steps == 26  # the first step after refine_stop
@@ -249,4 +251,4 @@ def test_early_end_is_remembered(dataset: Path, tmp_path: Path, monkeypatch: pyt
     again = train(config, tmp_path / "run", resume=True)
     assert again.steps == 26
     many = replace(config, sparse=replace(config.sparse, below_views=0))
-    assert train(many, tmp_path / "many").steps == 26 + schedule.settling_steps(many, 4)
+    assert train(many, tmp_path / "many").steps == 26 + RunPlan.of(many, load_scene(many.data)).schedule.settling

@@ -18,7 +18,8 @@ from gsopt.geometry import sh
 from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Gradients, RasterSettings
-from gsopt.training.content_window import MARGIN, MOST_SHARE, TILE, Window, content_window
+from gsopt.training.content_window import MARGIN, MAX_SHARE, TILE, Window, content_window
+from gsopt.training.plan import RunPlan
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import Target, cropped
 from gsopt.training.trainer import Trainer
@@ -33,7 +34,7 @@ def test_a_window_holds_all_that_shows_and_its_margin(height: int, width: int, d
     window = content_window(alphas)
     if window is None:
         return
-    assert (window.y1 - window.y0) * (window.x1 - window.x0) < MOST_SHARE * height * width
+    assert (window.y1 - window.y0) * (window.x1 - window.x0) < MAX_SHARE * height * width
     assert window.y0 % TILE == window.x0 % TILE == 0
     for y, x in alphas.nonzero().tolist():
         assert window.y0 <= max(0, y - MARGIN) < min(height, y + 1 + MARGIN) <= window.y1
@@ -156,7 +157,7 @@ def passed_steps(dataset: Path, schedule: ScheduleConfig) -> tuple[int, list[flo
     )
     scene = load_scene(config.data)
     gaussians, _ = first_gaussians(scene, config.init, 3, 0)
-    trainer = Trainer(config, scene, gaussians, make_backend("cpu", 1))
+    trainer = Trainer(RunPlan.of(config, scene), scene, gaussians, make_backend("cpu", 1))
     before, unmoved, losses = trainer.model.gaussians.means.clone(), 0, []
     for _ in range(30):
         losses.append(trainer.advance()[0])

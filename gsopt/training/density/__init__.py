@@ -1,4 +1,4 @@
-"""How many Gaussians there are and where: one protocol, two published strategies."""
+"""Density control, the number and places of the Gaussians: one protocol, two published strategies."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gsopt.config.train import TrainConfig
 from gsopt.raster.backend import Gradients
 from gsopt.training.optimizer import OptimizedGaussians
+from gsopt.training.plan import DensityPlan
+from gsopt.training.schedule import Schedule
 
 
 class DensityControl(Protocol):
@@ -23,7 +24,7 @@ class DensityControl(Protocol):
         ...
 
     def after_step(self, model: OptimizedGaussians, lr_means: float) -> None:
-        """Change parameters in place after the optimiser step; `lr_means` in scene units."""
+        """Change parameters in place after the optimizer step; `lr_means` in scene units."""
         ...
 
     def refine(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
@@ -43,15 +44,15 @@ class DensityControl(Protocol):
         ...
 
 
-def make_density(config: TrainConfig, extent: float, count: int, generator: torch.Generator) -> DensityControl:
-    """The configured strategy for `count` first Gaussians; `extent` of the scene in scene units."""
-    if config.density.strategy == "mcmc":
+def make_density(plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator) -> DensityControl:
+    """The run's strategy for `count` first Gaussians."""
+    if plan.strategy == "mcmc":
         from gsopt.training.density.mcmc import Mcmc
 
-        return Mcmc(config.density, config.iterations, generator)
+        return Mcmc(plan, schedule, generator)
     from gsopt.training.density.adc import Adc
 
-    return Adc(config.density, config.iterations, extent, count, generator)
+    return Adc(plan, schedule, count, generator)
 
 
 def at_least_one(keep: Bool[Tensor, "N"], scores: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:

@@ -9,43 +9,38 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gsopt.config.train import DensityConfig
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import quats as quaternions
 from gsopt.raster.backend import Gradients
-from gsopt.training import schedule
 from gsopt.training.density import at_least_one
 from gsopt.training.optimizer import OptimizedGaussians
+from gsopt.training.plan import DensityPlan
+from gsopt.training.schedule import Schedule
 
 # A split Gaussian becomes two whose scales are divided by this (Kerbl et al. 2023, section 5.2).
 SPLIT_SHRINK = 1.6
 
 
 class Adc:
-    """Grows where the image pulls hard on a projected centre, prunes what is transparent or too large."""
+    """Grows where the image pulls hard on a projected center, prunes what is transparent or too large."""
 
-    def __init__(
-        self, config: DensityConfig, iterations: int, extent: float, count: int, generator: torch.Generator
-    ) -> None:
-        self._config = config
-        self._budget = schedule.budget(config)
-        self._iterations = iterations
-        self._extent = extent
+    def __init__(self, plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator) -> None:
+        self._plan = plan
+        self._schedule = schedule
         self._generator = generator
-        self._stop = schedule.refine_stop(config, iterations)
         self._forget(count)
 
     def _forget(self, count: int) -> None:
         self.grad_sum = torch.zeros(count)
-        """Sum over views of |dLoss/dmean2d| in normalised device coordinates."""
+        """Sum over views of |dLoss/dmean2d| in normalized device coordinates."""
         self.seen = torch.zeros(count, dtype=torch.int32)
-        """In how many views the Gaussian was drawn."""
+        """Number of views in which the Gaussian was drawn."""
 
     def after_backward(
         self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
     ) -> None:
-        """Accumulate the gradient of the projected centres. Rows that were not drawn have none and are not counted."""
-        if step > self._stop:
+        """Accumulate the gradient of the projected centers. Rows that were not drawn have none and are not counted."""
+        if step > self._schedule.refine_stop:
             return
         v = gradients.means2d_abs if gradients.means2d_abs is not None else gradients.means2d
         self.grad_sum += torch.hypot(v[:, 0] * (0.5 * width), v[:, 1] * (0.5 * height))
@@ -56,11 +51,11 @@ class Adc:
 
     def refine(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Grow, prune and start the statistics afresh; lower all opacities when a reset is due."""
-        if schedule.refines(step, self._config, self._iterations):
+        if self._schedule.refines(step):
             model = self._grow_and_prune(step, model)
             self._forget(len(model))
-        if schedule.resets(step, self._config, self._iterations):
-            lower_opacities(model, 2 * self._config.prune_opacity)
+        if self._schedule.resets(step):
+            lower_opacities(model, 2 * self._plan.prune_opacity)
         return model
 
     def select(self, rows: Tensor) -> None:
@@ -76,9 +71,9 @@ class Adc:
         """Clone small Gaussians and split large ones where the mean gradient is above the threshold; prune both."""
         gaussians = model.gaussians
         scores = self.grad_sum / self.seen.clamp_min(1)
-        room = max(0, self._budget - len(model))
-        growing = best(scores > self._config.grow_grad2d, scores, room)
-        splitting = growing & (largest_scales(gaussians) > self._config.grow_scale3d * self._extent)
+        room = max(0, self._plan.max_gaussians - len(model))
+        growing = best(scores > self._plan.grow_grad2d, scores, room)
+        splitting = growing & (largest_scales(gaussians) > self._plan.split_scale)
         keep = at_least_one(self._keep(step, gaussians), gaussians.logit_opacities)
         halves = split(gaussians.select(splitting), self._generator)
         halves = halves.select(self._keep(step, halves))
@@ -87,9 +82,9 @@ class Adc:
 
     def _keep(self, step: int, gaussians: Gaussians) -> Bool[Tensor, "N"]:
         """Neither transparent nor, once opacities were reset, huge."""
-        keep = gaussians.opacities >= self._config.prune_opacity
-        if 0 < self._config.reset_every < step:
-            keep &= largest_scales(gaussians) <= self._config.prune_scale3d * self._extent
+        keep = gaussians.opacities >= self._plan.prune_opacity
+        if self._schedule.prunes_large(step):
+            keep &= largest_scales(gaussians) <= self._plan.prune_scale
         return keep
 
 
@@ -109,7 +104,7 @@ def largest_scales(gaussians: Gaussians) -> Float[Tensor, "N"]:
 
 
 def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
-    """Two smaller Gaussians for each one, their centres drawn from it."""
+    """Two smaller Gaussians for each one, their centers drawn from it."""
     twice = gaussians.append(gaussians)
     local = torch.randn(len(twice), 3, generator=generator) * twice.scales
     offsets = (quaternions.rotation_matrices(twice.quats) @ local[..., None])[..., 0]

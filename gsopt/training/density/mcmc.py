@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gsopt.config.train import DensityConfig
 from gsopt.raster.backend import Gradients
-from gsopt.training import schedule
 from gsopt.training.optimizer import OptimizedGaussians
+from gsopt.training.plan import DensityPlan
+from gsopt.training.schedule import Schedule
 
 # Noise is scaled by sigmoid(-STEEPNESS (o - HALF)): only nearly transparent Gaussians wander (the authors' constants).
 STEEPNESS = 100.0
@@ -19,7 +19,7 @@ HALF = 0.005
 # Above this opacity that factor is below 1e-4 and no noise is drawn: the move would be far below Adam's own.
 STEADY = 0.1
 # One Gaussian stands for at most this many copies in one relocation (the authors' constant).
-MOST_COPIES = 51
+MAX_COPIES = 51
 OPAQUE = 1 - 1e-7
 
 Columns = tuple[Tensor, Tensor, Tensor]
@@ -29,10 +29,9 @@ Columns = tuple[Tensor, Tensor, Tensor]
 class Mcmc:
     """Never prunes: what is transparent is moved on top of what is not, without changing the image."""
 
-    def __init__(self, config: DensityConfig, iterations: int, generator: torch.Generator) -> None:
-        self._config = config
-        self._budget = schedule.budget(config)
-        self._iterations = iterations
+    def __init__(self, plan: DensityPlan, schedule: Schedule, generator: torch.Generator) -> None:
+        self._plan = plan
+        self._schedule = schedule
         self._generator = generator
 
     def after_backward(
@@ -49,13 +48,13 @@ class Mcmc:
         opacities = torch.sigmoid(gaussians.logit_opacities.index_select(0, rows))
         mobility = torch.sigmoid((HALF - opacities) * STEEPNESS)
         xi = torch.randn(3, len(rows), generator=self._generator)
-        xi *= mobility * (self._config.noise_lr * lr_means)
+        xi *= mobility * (self._plan.noise_lr * lr_means)
         moves = spread(gaussians.quats.index_select(0, rows), gaussians.log_scales.index_select(0, rows), xi)
         gaussians.means.index_copy_(0, rows, moves.add_(gaussians.means.index_select(0, rows)))
 
     def refine(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Move the dead, then grow by a fixed share."""
-        if not schedule.refines(step, self._config, self._iterations):
+        if not self._schedule.refines(step):
             return model
         self._relocate(model)
         return self._grow(model)
@@ -72,10 +71,10 @@ class Mcmc:
     def _relocate(self, model: OptimizedGaussians) -> None:
         """Move every Gaussian at or below prune_opacity onto one drawn by opacity; in place."""
         opacities = model.gaussians.opacities
-        dead = torch.nonzero(opacities <= self._config.prune_opacity)[:, 0]
+        dead = torch.nonzero(opacities <= self._plan.prune_opacity)[:, 0]
         if len(dead) in (0, len(model)):
             return
-        weights = torch.where(opacities > self._config.prune_opacity, opacities, 0.0)
+        weights = torch.where(opacities > self._plan.prune_opacity, opacities, 0.0)
         sources = draw(weights, len(dead), self._generator)
         self._share(model, sources)
         for _, tensor in model.gaussians.items():
@@ -84,7 +83,7 @@ class Mcmc:
 
     def _grow(self, model: OptimizedGaussians) -> OptimizedGaussians:
         """Add copies of Gaussians drawn by opacity, up to growth · N or the budget."""
-        target = min(self._budget, int(self._config.growth * len(model)))
+        target = min(self._plan.max_gaussians, int(self._plan.growth * len(model)))
         if target <= len(model):
             return model
         sources = draw(model.gaussians.opacities, target - len(model), self._generator)
@@ -96,7 +95,7 @@ class Mcmc:
         copies = torch.bincount(sources, minlength=len(model)) + 1
         rows = torch.nonzero(copies > 1)[:, 0]
         opacities, shrink = shared(model.gaussians.opacities[rows], copies[rows])
-        opacities = opacities.clamp(self._config.prune_opacity, OPAQUE)
+        opacities = opacities.clamp(self._plan.prune_opacity, OPAQUE)
         model.gaussians.logit_opacities[rows] = torch.logit(opacities).float()
         model.gaussians.log_scales[rows] += shrink.log().float()[:, None]
         model.forget(rows)
@@ -108,7 +107,7 @@ def shared(opacities: Float[Tensor, "M"], copies: Int[Tensor, "M"]) -> tuple[Flo
     o' = 1 - (1 - o)^(1/n), and the factor is o / Σ_{j=1..n} C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum over
     i and k with Σ_i C(i-1, k) = C(n, k+1) carried out, j = k + 1.
     """
-    n = copies.clamp_max(MOST_COPIES).double()
+    n = copies.clamp_max(MAX_COPIES).double()
     o = opacities.double().clamp_max(OPAQUE)
     new = 1 - (1 - o) ** (1 / n)
     total = torch.zeros_like(o)

@@ -1,4 +1,4 @@
-"""Which prompts help on this scene: short guided runs, one per set, each judged by an input view it never saw."""
+"""Compares sets of prompts on a scene: a short guided run for each, measured on an input view that it never saw."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from gsopt.events import Report
 from gsopt.llm_prompts.schema import Prompt
 from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
-from gsopt.sds.candidate_views import square_views
-from gsopt.sds.conditioning import Conditioning, encode
+from gsopt.sds.guidance_step import GuidanceSetup
 from gsopt.sds.priors.protocol import Prior
-from gsopt.training.guided.guard import WHITE, HeldOutView, short_config, short_run, spread_views, without
-from gsopt.training.guided.session import EMBEDDED_INPUTS, front_camera, read_references
+from gsopt.training.guided.guard import HeldOutView, short_config, short_run, spread_views, without
+from gsopt.training.guided.references import encoded, front_camera, read_references
 from gsopt.training.mirror_images import with_mirrors
 
 
@@ -38,7 +37,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an arm did."""
+    """Result of an arm."""
 
     arm: Arm
     psnrs: tuple[float, ...]
@@ -79,31 +78,27 @@ def compare_prompts(
         )
     scene = with_mirrors(config, scene)
     short = short_config(config, scene, prior.aligned)
-    lefts = [without(scene, index) for index in spread_views(scene, max(1, config.guidance.guard_views))]
+    held_out = [without(scene, index) for index in spread_views(scene, max(1, config.guidance.guard_views))]
     truths: list[Tensor] = []
     outcomes = []
     for arm in arms:
         drawn, scores = [], []
-        for left in lefts:
-            known = None if arm.weight == 0 else _conditioning(short, left, prior, arm)
-            front = front_camera(config, left.scene)
-            aid = None if known is None else (prior, known, arm.weight, front, report)
-            picture, truth = short_run(short, left, backend, aid)
+        for left_out in held_out:
+            setup = None if arm.weight == 0 else _setup(short, left_out, prior, arm, report)
+            picture, truth = short_run(short, left_out, backend, setup)
             drawn.append(picture)
-            truths += [truth] if len(truths) < len(lefts) else []
-            scores += [] if known is None else [p.score for p in known.prompts if p.score is not None]
+            truths += [truth] if len(truths) < len(held_out) else []
+            scores += [] if setup is None else [p.score for p in setup.conditioning.prompts if p.score is not None]
         psnrs = tuple(
             float(capped_psnr(picture[None], truth[None])) for picture, truth in zip(drawn, truths, strict=True)
         )
         outcomes.append(Outcome(arm, psnrs, tuple(drawn), sum(scores) / len(scores) if scores else None))
-        report(f"{arm.name}: {outcomes[-1].mean:.2f} dB on {len(lefts)} left-out views")
-    return Comparison(tuple(left.view.name for left in lefts), tuple(truths), tuple(outcomes))
+        report(f"{arm.name}: {outcomes[-1].mean:.2f} dB on {len(held_out)} left-out views")
+    return Comparison(tuple(left_out.view.name for left_out in held_out), tuple(truths), tuple(outcomes))
 
 
-def _conditioning(config: TrainConfig, left: HeldOutView, prior: Prior, arm: Arm) -> Conditioning:
-    """The arm's words and pictures, encoded without the view that is left out."""
-    views = left.scene.train
-    inputs = square_views(views[:: max(1, -(-len(views) // EMBEDDED_INPUTS))], prior.size, WHITE).images
+def _setup(config: TrainConfig, left_out: HeldOutView, prior: Prior, arm: Arm, report: Report) -> GuidanceSetup:
+    """The arm's prompts and reference images, encoded without the view that is left out."""
     references = read_references(arm.references, prior.size)
-    weight = config.guidance.image_weight
-    return encode(prior.encoder(), arm.prompts, inputs, references, weight, prior.class_embedding_width)
+    conditioning = encoded(config.guidance.image_weight, left_out.scene, prior, arm.prompts, references)
+    return GuidanceSetup(prior, conditioning, front_camera(config.guidance, left_out.scene), arm.weight, report)

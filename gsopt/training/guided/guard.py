@@ -1,13 +1,13 @@
-"""The guard: short runs without one input view say whether guidance helps there, before the run itself is guided.
+"""The guard: short runs without one input view measure whether guidance helps, before the run itself is guided.
 
-A view the model has learned from cannot tell: any prior only blurs what is known. So every view that is left out gets a
-model that never saw it, first Gaussians included.
+A view that the model has learned from is no measure: any prior only blurs what is known. So every view that is left out
+gets a model that never saw it, first Gaussians included.
 
-A view-conditioned prior is asked what that model's render should look like: only one whose answers are closer to the
-left-out views, by REPAIR at least, guides the run. What a run gains follows from that (docs/howto/guidance.md).
+A view-conditioned prior predicts that model's render of the view: only one whose predictions are closer to the left-out
+views, by REPAIR at least, guides the run. docs/howto/guidance.md has the gain that follows.
 
-Of a text-to-image prior single answers tell little. There a second model is guided, the same in all else. Where that
-lowers the mean PSNR of the left-out views, lambda is halved and tried again; after three trials it is 0.
+Single predictions of a text-to-image prior mean little. For it a second model is guided, the same in all else. While
+that lowers the mean PSNR of the left-out views, lambda is halved and tried again; after three trials it is 0.
 """
 
 from __future__ import annotations
@@ -20,48 +20,42 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.config.guidance import settled
 from gsopt.config.train import InitConfig, ScheduleConfig, TrainConfig
 from gsopt.data.scene import Scene, View
 from gsopt.data.split import farthest_points
 from gsopt.errors import NumericalError
-from gsopt.events import Report
-from gsopt.geometry.cameras import Cameras
 from gsopt.init import first_gaussians
 from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
-from gsopt.sds import schedule as sds_schedule
-from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.priors.protocol import Prior
-from gsopt.training import schedule
-from gsopt.training.guided.session import RunGuidance, make_guide
+from gsopt.sds.guidance_plan import resolved_every
+from gsopt.sds.guidance_step import GuidanceSetup
+from gsopt.training.guided.session import RunGuidance
+from gsopt.training.plan import RunPlan
 from gsopt.training.targets import Targets
 from gsopt.training.trainer import Trainer
 
-REPAIR = 0.5
-"""dB. Fits with a view less are easier to repair than the run's own: by this much, a prior that knows nothing more may
+MIN_GAIN = 0.5
+"""dB. Runs with a view less are easier to repair than the run's own: by this much, a prior that knows nothing more may
 seem to help."""
-LOOKS = 4
-"""Noise levels at which a prior is asked about each left-out view, those of the guided steps."""
+NOISE_LEVELS = 4
+"""Noise levels of the predictions for each left-out view, those of the guided steps."""
 FACTORS = (1.0, 0.5, 0.25)
-SIDE = 128
+SHORT_RUN_SIDE = 128
 """Longer side of the images of a short run, px, as near as halving comes."""
-GAUSSIANS = 5000
+SHORT_RUN_GAUSSIANS = 5000
 WHITE = torch.ones(3)
-Aid = tuple[Prior, Conditioning, float, Cameras, Report]
-"""What guides a short run: `make_guide`'s last arguments."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the guard found."""
+    """The guard's decision."""
 
     factor: float
     """On lambda."""
     reason: str
     trials: list[dict[str, Any]]
-    """Per left-out view: its name and by how many dB it was repaired. Or, of a text-to-image prior, per trial: factor,
-    and mean PSNR of the left-out views with and without guidance, dB."""
+    """Per left-out view: its name and the PSNR gain of the predictions, dB. For a text-to-image prior, per trial:
+    factor, and mean PSNR of the left-out views with and without guidance, dB."""
 
 
 @dataclass(frozen=True)
@@ -73,59 +67,55 @@ class HeldOutView:
     view: View
 
 
-def evaluate_guidance(
-    config: TrainConfig,
-    scene: Scene,
-    backend: Backend,
-    prior: Prior,
-    conditioning: Conditioning,
-    weight: float,
-    front: Cameras,
-    warn: Report,
-) -> Verdict:
-    """How much of `weight` the run should have, going by input views that were left out."""
-    guidance = config.guidance
+def evaluate_guidance(config: TrainConfig, scene: Scene, backend: Backend, setup: GuidanceSetup) -> Verdict:
+    """The share of its weight that guidance gets in the run, measured on input views that were left out."""
+    guidance, aligned = config.guidance, setup.prior.aligned
     if guidance.guard_views == 0:
         return Verdict(1.0, "not checked: --guidance.guard-views is 0", [])
     if len(scene.train) < 2:
         only = "one input view cannot say whether it helps"
-        return Verdict(0.0, f"off: {only}", []) if prior.aligned else Verdict(1.0, f"not checked: {only}", [])
-    short = short_config(config, scene, prior.aligned)
-    lefts = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
-    aid = prior, conditioning, weight, front, warn
-    return _repairs(short, lefts, backend, aid) if prior.aligned else _helps(short, lefts, backend, aid)
+        return Verdict(0.0, f"off: {only}", []) if aligned else Verdict(1.0, f"not checked: {only}", [])
+    short = short_config(config, scene, aligned)
+    held_out = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
+    check = _check_predictions if aligned else _check_guided_runs
+    return check(short, held_out, backend, setup)
 
 
-def _repairs(config: TrainConfig, lefts: list[HeldOutView], backend: Backend, aid: Aid) -> Verdict:
-    """Whether the prior's answers are closer to the left-out views than what it is shown."""
-    first, last = (of(config.guidance, config.iterations) for of in (sds_schedule.first_step, sds_schedule.last_step))
-    steps = [first + (last - first) * look // (LOOKS - 1) for look in range(LOOKS)]
-    repairs: dict[str, float] = {}
-    for left in lefts:
-        trainer = _trained(config, left, backend, None)
-        guide, gaussians = make_guide(config, left.scene, backend, *aid), trainer.model.gaussians
+def _check_predictions(
+    config: TrainConfig, held_out: list[HeldOutView], backend: Backend, setup: GuidanceSetup
+) -> Verdict:
+    """Passes a prior whose predictions are closer to the left-out views than the renders."""
+    gains: dict[str, float] = {}
+    for left_out in held_out:
+        trainer = _trained(config, left_out, backend, None)
+        guidance = setup.on(left_out.scene, backend, trainer.plan.guidance)
+        first, last = guidance.plan.first_step, guidance.plan.last_step
+        steps = [first + (last - first) * level // (NOISE_LEVELS - 1) for level in range(NOISE_LEVELS)]
+        gaussians, settings = trainer.model.gaussians, trainer.settings()
         try:
-            found = [guide.repair(step, left.view, gaussians, trainer.settings()) for step in steps]
+            found = [guidance.repair(step, left_out.view, gaussians, settings) for step in steps]
         except NumericalError as error:
             return Verdict(0.0, f"the prior failed: {error}", [])
-        repairs[left.view.name] = round(sum(found) / LOOKS, 4)
-    mean = sum(repairs.values()) / len(repairs)
-    trials = [{"view": name, "repair": repair} for name, repair in repairs.items()]
-    said = f"its answers are {mean:+.2f} dB closer to left-out views than the renders"
-    return Verdict(1.0, said, trials) if mean >= REPAIR else Verdict(0.0, f"{said}, {REPAIR:g} are asked for", trials)
+        gains[left_out.view.name] = round(sum(found) / NOISE_LEVELS, 4)
+    mean = sum(gains.values()) / len(gains)
+    trials = [{"view": name, "repair": gain} for name, gain in gains.items()]
+    reason = f"its answers are {mean:+.2f} dB closer to left-out views than the renders"
+    if mean >= MIN_GAIN:
+        return Verdict(1.0, reason, trials)
+    return Verdict(0.0, f"{reason}, {MIN_GAIN:g} are asked for", trials)
 
 
-def _helps(config: TrainConfig, lefts: list[HeldOutView], backend: Backend, aid: Aid) -> Verdict:
-    """The largest factor on lambda at which a guided short run is no worse than one that is not."""
-    prior, conditioning, weight, front, warn = aid
-    plain = sum(_psnr(config, left, backend, None) for left in lefts) / len(lefts)
+def _check_guided_runs(
+    config: TrainConfig, held_out: list[HeldOutView], backend: Backend, setup: GuidanceSetup
+) -> Verdict:
+    """The largest factor on lambda at which guided short runs are no worse than those that are not guided."""
+    plain = _mean_psnr(config, held_out, backend, None)
     trials = []
     for factor in FACTORS:
-        made = [_psnr(config, left, backend, (prior, conditioning, factor * weight, front, warn)) for left in lefts]
-        guided = sum(made) / len(lefts)
+        guided = _mean_psnr(config, held_out, backend, replace(setup, weight=factor * setup.weight))
         trials.append({"factor": factor, "plain": round(plain, 4), "guided": round(guided, 4)})
         if guided >= plain:
-            names = ", ".join(left.view.name for left in lefts)
+            names = ", ".join(left_out.view.name for left_out in held_out)
             return Verdict(factor, f"{guided - plain:+.2f} dB on {names} when left out", trials)
     return Verdict(0.0, "guidance made every left-out view worse, at a quarter of its weight too", trials)
 
@@ -134,22 +124,21 @@ def short_config(config: TrainConfig, scene: Scene, view_conditioned: bool) -> T
     """A small copy of the run: few steps on small images, few Gaussians, no density control, guided as the run is."""
     steps = config.guidance.guard_steps
     longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
-    halvings = min(6, max(0, round(math.log2(longest / SIDE))))
-    # What was asked for may not fit with a view less, where "auto" then takes something else.
+    halvings = min(6, max(0, round(math.log2(longest / SHORT_RUN_SIDE))))
+    # The method of the run may need the view that is left out; "auto" then takes another one.
     method = "auto" if config.init.method in ("hull", "stereo") else config.init.method
-    guidance = settled(config.guidance, view_conditioned)
-    guidance = replace(guidance, every=min(guidance.every or 1, max(1, steps // 24)), refresh_every=max(1, steps // 8))
-    return replace(
+    every = resolved_every(config.guidance, view_conditioned)
+    short = replace(
         config,
-        iterations=steps,
-        init=InitConfig(method, min(GAUSSIANS, config.init.count)),
+        init=InitConfig(method, min(SHORT_RUN_GAUSSIANS, config.init.count)),
         density=replace(config.density, refine_start=steps, refine_stop=steps),
         # Downscaled by 2 for every entry that no step passes.
         schedule=ScheduleConfig(coarse_until=tuple(steps + i for i in range(halvings))),
-        guidance=guidance,
+        guidance=replace(config.guidance, every=min(every, max(1, steps // 24)), refresh_every=max(1, steps // 8)),
         checkpoint_every=0,
         preview_every=0,
     )
+    return short.with_steps(steps)
 
 
 def without(scene: Scene, index: int) -> HeldOutView:
@@ -166,27 +155,30 @@ def spread_views(scene: Scene, count: int) -> list[int]:
 
 
 def short_run(
-    config: TrainConfig, left: HeldOutView, backend: Backend, guide: Aid | None
+    config: TrainConfig, left_out: HeldOutView, backend: Backend, setup: GuidanceSetup | None
 ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
-    """The left-out view after a short run on the others, 0..1 on white, and how it really looks."""
-    trainer = _trained(config, left, backend, guide)
-    target = Targets([left.view], WHITE, 0).get(0, schedule.downscale(1, config.schedule.coarse_until or ()), WHITE)
+    """Render of the left-out view after a short run on the others, 0..1 on white, and its photo."""
+    trainer = _trained(config, left_out, backend, setup)
+    target = Targets([left_out.view], WHITE, 0).get(0, trainer.plan.schedule.downscale(1), WHITE)
     colors = backend.forward(trainer.model.gaussians, target.camera, trainer.settings(), WHITE).colors
     return colors.clamp(0, 1), target.colors
 
 
-def _trained(config: TrainConfig, left: HeldOutView, backend: Backend, guide: Aid | None) -> Trainer:
+def _trained(config: TrainConfig, left_out: HeldOutView, backend: Backend, setup: GuidanceSetup | None) -> Trainer:
     """A short run at its end."""
-    degree = schedule.max_sh_degree(config, len(left.scene.train))
-    gaussians, _ = first_gaussians(left.scene, config.init, degree, config.seed)
-    guidance = None if guide is None else RunGuidance(make_guide(config, left.scene, backend, *guide))
-    trainer = Trainer(config, left.scene, gaussians, backend, guidance)
-    while trainer.step < config.iterations:
+    scene = left_out.scene
+    plan = RunPlan.of(config, scene)
+    gaussians, _ = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
+    guidance = None if setup is None else RunGuidance(setup.on(scene, backend, plan.guidance))
+    trainer = Trainer(plan, scene, gaussians, backend, guidance)
+    while trainer.step < plan.schedule.iterations:
         trainer.advance()
     return trainer
 
 
-def _psnr(config: TrainConfig, left: HeldOutView, backend: Backend, guide: Aid | None) -> float:
-    """Of the left-out view after a short run on the others, dB."""
-    colors, truth = short_run(config, left, backend, guide)
-    return float(capped_psnr(colors[None], truth[None]))
+def _mean_psnr(
+    config: TrainConfig, held_out: list[HeldOutView], backend: Backend, setup: GuidanceSetup | None
+) -> float:
+    """Mean PSNR of the left-out views after short runs on the others, dB."""
+    pairs = [short_run(config, left_out, backend, setup) for left_out in held_out]
+    return sum(float(capped_psnr(colors[None], truth[None])) for colors, truth in pairs) / len(held_out)

@@ -1,27 +1,29 @@
-"""Before the first step: which prior guides the run, and how much the guard lets it. Decided once, then kept."""
+"""Before the first step: chooses the prior of a run and, by the guard, its weight. Decided once, then recorded."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from gsopt.config.guidance import settled, sure
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.init import first_gaussians
 from gsopt.raster.backend import Backend
 from gsopt.sds.conditioning import Conditioning
-from gsopt.sds.coverage import coverage
-from gsopt.sds.guidance_step import Guide
+from gsopt.sds.guidance_step import Guidance, GuidanceSetup
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.select_prior import choose, fitting
-from gsopt.training import schedule
 from gsopt.training.guided.guard import Verdict, evaluate_guidance
-from gsopt.training.guided.session import CONDITIONING, FOLDER, RunGuidance, front_camera, make_conditioning, make_guide
+from gsopt.training.guided.references import CONDITIONING, FOLDER, front_camera, make_conditioning
+from gsopt.training.guided.session import RunGuidance
+from gsopt.training.plan import RunPlan
 from gsopt.training.run_directory import RunDirectory
 
 
-def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> RunGuidance | None:
-    """What guides this run, None for nothing. The choice and its reason stand in config.json and in `started`.
+def start_guidance(
+    config: TrainConfig, plan: RunPlan, scene: Scene, backend: Backend, directory: RunDirectory
+) -> RunGuidance | None:
+    """The guidance of this run, None for none. The choice and its reason stand in config.json and in `started`.
 
     A resumed run keeps the choice it began with. Raises UsageError and InputError before any training when the prior
     that was asked for cannot be had.
@@ -34,45 +36,49 @@ def start_guidance(config: TrainConfig, scene: Scene, backend: Backend, director
             directory.record(guidance=recorded)
     if recorded["prior"] is None:
         return None
-    front = front_camera(config, scene)
+    setup = _opened(config, scene, recorded, directory)
+    if "guard" not in recorded:
+        verdict = _verdict(config, plan, scene, backend, setup)
+        policy = plan.guidance.for_prior(setup.prior.aligned).policy
+        recorded = {**recorded, **_record(verdict, setup.prior.name, policy)}
+        directory.record(guidance=recorded)
+        directory.emit("guidance", message=_sentence(verdict, setup.weight), **recorded["guard"])
+    folder = directory.path / FOLDER
+    folder.mkdir(exist_ok=True)
+    allowed = replace(setup, weight=setup.weight * float(recorded["guard"]["factor"]))
+    return RunGuidance(allowed.on(scene, backend, plan.guidance), folder, facts=recorded)
+
+
+def _opened(config: TrainConfig, scene: Scene, recorded: dict[str, Any], directory: RunDirectory) -> GuidanceSetup:
+    """The prior that was chosen, opened, with its conditioning; a resumed run keeps the conditioning it began with."""
+    front = front_camera(config.guidance, scene)
     folder = directory.path / FOLDER
     prior = open_prior(recorded["prior"], config.guidance)
     directory.emit("guidance", message=f"prior {prior.name}, {recorded['reason']}", prior=prior.name)
-    judged, saved = "guard" in recorded, folder / CONDITIONING
-    if judged and saved.exists():
+    saved = folder / CONDITIONING
+    if "guard" in recorded and saved.exists():
         conditioning = Conditioning.load(saved)
-    else:  # what stands there without a verdict is of a run that was broken off, perhaps of other words
-        conditioning = make_conditioning(config, scene, prior, folder, directory.warn)
-
-    def guide(weight: float) -> Guide:
-        return make_guide(config, scene, backend, prior, conditioning, weight, front, directory.warn)
-
-    if not judged:
-        weight = float(recorded["lambda_sds"])
-        if decided(config, scene, guide(weight)):
-            verdict = Verdict(1.0, "not checked: the input views decide everywhere already", [])
-        else:
-            verdict = evaluate_guidance(config, scene, backend, prior, conditioning, weight, front, directory.warn)
-        recorded = {**recorded, **_told(verdict, prior.name, settled(config.guidance, prior.aligned).policy)}
-        directory.record(guidance=recorded)
-        directory.emit("guidance", message=_sentence(verdict, weight), **recorded["guard"])
-    folder.mkdir(exist_ok=True)
-    weight = float(recorded["lambda_sds"]) * float(recorded["guard"]["factor"])
-    return RunGuidance(guide(weight), folder, facts=recorded)
+    else:  # a file without a verdict is of a run that was broken off, perhaps of other words
+        conditioning = make_conditioning(config.guidance, scene, prior, folder, directory.warn)
+    return GuidanceSetup(prior, conditioning, front, float(recorded["lambda_sds"]), directory.warn)
 
 
-def decided(config: TrainConfig, scene: Scene, guide: Guide) -> bool:
-    """Whether the input views see the first Gaussians from everywhere: then no step would be guided."""
-    least = sure(guide.config.min_uncertainty)
+def _verdict(config: TrainConfig, plan: RunPlan, scene: Scene, backend: Backend, setup: GuidanceSetup) -> Verdict:
+    if inputs_decide(plan, scene, setup.on(scene, backend, plan.guidance)):
+        return Verdict(1.0, "not checked: the input views decide everywhere already", [])
+    return evaluate_guidance(config, scene, backend, setup)
+
+
+def inputs_decide(plan: RunPlan, scene: Scene, guidance: Guidance) -> bool:
+    """True when the input views see the first Gaussians from everywhere: then no step would be guided."""
+    least = guidance.plan.min_uncertainty
     if least == 0:
         return False
-    degree = schedule.max_sh_degree(config, len(scene.train))
-    gaussians, _ = first_gaussians(scene, config.init, degree, config.seed)
-    covered = coverage(gaussians, guide.inputs, guide.backend)
-    return bool((guide.mean_uncertainty(gaussians, covered) < least).all())
+    gaussians, _ = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
+    return bool((guidance.observer.coverage(0, gaussians).mean_u < least).all())
 
 
-def _told(verdict: Verdict, prior: str, policy: str) -> dict[str, Any]:
+def _record(verdict: Verdict, prior: str, policy: str) -> dict[str, Any]:
     guard = {"factor": verdict.factor, "reason": verdict.reason, "trials": verdict.trials}
     return {"model": prior, "policy": policy, "guard": guard}
 

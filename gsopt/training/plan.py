@@ -1,0 +1,209 @@
+"""`RunPlan`: the settings of a run, resolved once against its scene. Nothing in it is left open."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gsopt.config.train import DensityConfig, InitConfig, PoseConfig, SparseConfig, TrainConfig
+from gsopt.data.background import Background
+from gsopt.data.scene import Scene
+from gsopt.sds.guidance_plan import GuidancePlans
+from gsopt.training.schedule import Schedule
+from gsopt.training.targets import content_pixels
+
+# Published end of refinement (Kerbl et al. 2023; Kheradmand et al. 2024), and its share of a shorter run.
+REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}
+# Shares of a run drawn at a quarter and at half of the resolution. Early steps only move coarse shapes; with few views
+# a longer coarse phase keeps fine detail from being learned as view-dependent fog (docs/decisions/0001-schedule.md).
+COARSE_SHARES, COARSE_SHARES_SPARSE = (0.06, 0.23), (1 / 6, 1 / 2)
+# The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
+GAUSSIANS_PER_PIXEL = 1.44
+MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
+# Mirror images drawn per epoch, times the number of photos: the more photos there are, the less they leave open and the
+# more the images blur what the photos show (docs/decisions/0002-symmetry.md).
+MIRRORED_TIMES_VIEWS = 32
+# Share of a run in which the rates fall, so that it does not end in the noise of the last few views it drew.
+SETTLING_SHARE = 0.05
+# Most memory for float targets, as a share of the decoded images': both hold the same views.
+TARGET_CACHE_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms of the training loss."""
+
+    dssim: float
+    alpha: float
+    opacity: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class DensityPlan:
+    """`DensityConfig` with nothing left open, but for the steps, which `Schedule` has."""
+
+    strategy: str
+    max_gaussians: int
+    grow_grad2d: float
+    absgrad: bool
+    split_scale: float
+    """adc: split above, clone below this scale, scene units."""
+    prune_opacity: float
+    prune_scale: float
+    """adc: remove larger ones after the first opacity reset, scene units."""
+    noise_lr: float
+    growth: float
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """One run on one scene."""
+
+    seed: int
+    sparse: bool
+    """True when the regularizers for few views are on."""
+    background: Background
+    antialiased: bool
+    init: InitConfig
+    weights: LossWeights
+    schedule: Schedule
+    density: DensityPlan
+    poses: PoseConfig
+    guidance: GuidancePlans
+    mirrored_per_epoch: int
+    """Number of mirror images drawn beside every input view once."""
+    target_cache_mb: float
+    stop_when_flat: bool
+    crop_masked: bool
+    rest_converged: bool
+    residual_bands: bool
+    """True when a band is drawn only where the residual depends on the view."""
+    checkpoint_every: int
+    preview_every: int
+
+    @staticmethod
+    def of(config: TrainConfig, scene: Scene) -> RunPlan:
+        """Resolves the settings against a scene, mirror images included."""
+        views = len(scene.train)
+        sparse = is_sparse(config.sparse, views)
+        iterations = shortened(config, views)
+        background = Background.of(config.data)
+        budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), iterations)
+        schedule = make_schedule(config, iterations, sparse, scene.extent)
+        return RunPlan(
+            seed=config.seed,
+            sparse=sparse,
+            background=background,
+            antialiased=config.antialiased,
+            init=config.init,
+            weights=loss_weights(config, sparse),
+            schedule=schedule,
+            density=density_plan(config.density, budget, scene.extent),
+            poses=config.poses,
+            guidance=GuidancePlans.of(config.guidance, iterations, config.seed, background),
+            mirrored_per_epoch=mirrored_per_epoch(views, len(scene.mirrored)),
+            target_cache_mb=TARGET_CACHE_SHARE * config.data.cache_mb,
+            stop_when_flat=config.schedule.stop_when_flat,
+            crop_masked=config.schedule.crop_masked,
+            rest_converged=config.schedule.rest_converged,
+            residual_bands=config.schedule.bands == "residual",
+            checkpoint_every=config.checkpoint_every,
+            preview_every=config.preview_every,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready, for config.json."""
+        return json.loads(json.dumps(asdict(self)))
+
+
+def is_sparse(config: SparseConfig, views: int) -> bool:
+    """True when the regularizers for few views are on."""
+    return views <= config.below_views
+
+
+def shortened(config: TrainConfig, views: int) -> int:
+    """The number of steps, no more than few views can use."""
+    per_view = config.sparse.steps_per_view
+    if per_view == 0 or not is_sparse(config.sparse, views):
+        return config.iterations
+    return min(config.iterations, per_view * views)
+
+
+def make_schedule(config: TrainConfig, iterations: int, sparse: bool, extent: float) -> Schedule:
+    """The schedule of a run of so many steps. No rate falls at the end with few views, where the noise of single steps
+    acts as a regularizer against overfitting (docs/decisions/0001-schedule.md); few views cannot tell view dependence
+    from shape, so that they get fewer bands."""
+    density, degree = config.density, config.optimizer.sh_degree
+    return Schedule(
+        iterations=iterations,
+        extent=extent,
+        optimizer=config.optimizer,
+        settling=0 if sparse else math.ceil(SETTLING_SHARE * iterations),
+        coarse_until=coarse_until(config.schedule.coarse_until, iterations, sparse),
+        max_sh_degree=min(degree, config.sparse.sh_degree) if sparse else degree,
+        refine_start=density.refine_start,
+        refine_stop=refine_stop(density, iterations),
+        refine_every=density.refine_every,
+        reset_every=density.reset_every,
+        max_dropout=config.sparse.dropout if sparse else 0.0,
+        floater_every=config.sparse.floater_every if sparse else 0,
+    )
+
+
+def coarse_until(given: tuple[int, ...] | None, iterations: int, sparse: bool) -> tuple[int, ...]:
+    """Last steps at a quarter and at half of the resolution, as given or as shares of the run."""
+    if given is not None:
+        return given
+    steps = (round(share * iterations) for share in (COARSE_SHARES_SPARSE if sparse else COARSE_SHARES))
+    return tuple(step for step in steps if step > 0)
+
+
+def refine_stop(config: DensityConfig, iterations: int) -> int:
+    """Last step after which Gaussians may be added or removed."""
+    if config.refine_stop is not None:
+        return config.refine_stop
+    published, share = REFINE_STOP[config.strategy]
+    return min(published, round(share * iterations))
+
+
+def loss_weights(config: TrainConfig, sparse: bool) -> LossWeights:
+    """The run's weights: LossConfig's (0.01 for mcmc's two, Kheradmand et al. 2024), or SparseConfig's if larger."""
+    loss, few = config.loss, config.sparse
+    default = 0.01 if config.density.strategy == "mcmc" else 0.0
+    alpha = loss.lambda_alpha
+    opacity = default if loss.lambda_opacity is None else loss.lambda_opacity
+    scale = default if loss.lambda_scale is None else loss.lambda_scale
+    if not sparse:
+        return LossWeights(loss.lambda_dssim, alpha, opacity, scale)
+    raised = max(alpha, few.lambda_alpha), max(opacity, few.lambda_opacity), max(scale, few.lambda_scale)
+    return LossWeights(loss.lambda_dssim, *raised)
+
+
+def density_plan(config: DensityConfig, budget: int, extent: float) -> DensityPlan:
+    """The parameters of density control; lengths in scene units."""
+    return DensityPlan(
+        strategy=config.strategy,
+        max_gaussians=budget,
+        grow_grad2d=config.grow_grad2d,
+        absgrad=config.absgrad,
+        split_scale=config.grow_scale3d * extent,
+        prune_opacity=config.prune_opacity,
+        prune_scale=config.prune_scale3d * extent,
+        noise_lr=config.noise_lr,
+        growth=config.growth,
+    )
+
+
+def default_budget(pixels: float, iterations: int) -> int:
+    """Number of Gaussians that `pixels`, those of an image that show something, can use in a run this long."""
+    longer = iterations / 7000
+    wanted = round(GAUSSIANS_PER_PIXEL * pixels * max(longer, math.sqrt(longer)))
+    return min(max(wanted, MIN_BUDGET), MAX_BUDGET)
+
+
+def mirrored_per_epoch(views: int, images: int) -> int:
+    """Number of mirror images drawn beside every input view once."""
+    return min(images, round(MIRRORED_TIMES_VIEWS / views))
