@@ -112,7 +112,7 @@ def ring_angles(mean_elevation: float) -> Float[Tensor, "C 2"]:
 
 
 def draw_candidate(mean_u: Float[Tensor, "C"], least: float, generator: torch.Generator) -> int | None:
-    """A candidate, with probability proportional to its mean uncertainty. Draws none (None) when all lie below `least`."""
+    """A candidate, drawn in proportion to its mean uncertainty; none when all lie below `least`."""
     chances = torch.where(mean_u >= least, mean_u.double(), 0.0)
     if float(chances.sum()) <= 0:
         return None
