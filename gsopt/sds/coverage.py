@@ -67,7 +67,7 @@ def seen(gaussians: Gaussians, camera: Cameras, backend: Backend) -> Float[Tenso
 
 
 def facing(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "N"]:
-    """Facing of each Gaussian to an eye: 1 for balls; for discs a smooth step over |cos| between the eye and the shortest axis."""
+    """Visibility by orientation: 1 for balls; for discs a smooth step over |cos| to the shortest axis."""
     scales = gaussians.scales
     order = scales.sort(dim=-1)
     normal = rotation_matrices(gaussians.quats).gather(2, order.indices[:, None, :1].expand(-1, 3, 1))[..., 0]
