@@ -234,7 +234,7 @@ class ScheduleConfig:
 
     coarse_until: tuple[int, ...] | None = None
     """Steps at which the resolution doubles, e.g. 500 1500: quarter, half, full. When not given, shares of the run
-    (training/schedule.py); the flag without a step means full resolution throughout."""
+    (training/plan.py); the flag without a step means full resolution throughout."""
     stop_when_flat: bool = False
     """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
     crop_masked: bool = False
