@@ -134,16 +134,8 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | None) -> dict[str, Any]:
     split, views = ("test", scene.test) if scene.test else ("train", evenly_spread(scene.train, MAX_TRAIN_VIEWS))
-    evaluated = evaluate_views(
-        finished.gaussians,
-        views,
-        finished.backend,
-        finished.settings,
-        finished.background,
-        finished.path / "renders" / split,
-        vgg=vgg,
-        on_view=on_view,
-    )
+    drawing = finished.backend, finished.settings, finished.background, finished.path / "renders" / split
+    evaluated = evaluate_views(finished.gaussians, views, *drawing, vgg=vgg, on_view=on_view)
     for row in evaluated["per_view"]:
         row["render"] = f"renders/{split}/{row['render']}"
     notes = [VGG_NOTE] if vgg and find_vgg_weights() is None else []

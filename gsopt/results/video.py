@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from jaxtyping import UInt8
 from PIL import Image
@@ -50,16 +50,9 @@ def write_video(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: f
     first = next(images)
     # GIF counts in hundredths of a second, and players slow down frames shorter than two of them.
     duration = round(1000 / fps) if kind == ".webp" else max(20, 10 * round(100 / fps))
-    options = {"quality": WEBP_QUALITY, "method": 4} if kind == ".webp" else {"optimize": False}
-    first.save(
-        file,
-        format=kind[1:].upper(),
-        save_all=True,
-        append_images=images,
-        duration=duration,
-        loop=0,
-        **options,
-    )
+    options: dict[str, Any] = {"quality": WEBP_QUALITY, "method": 4} if kind == ".webp" else {"optimize": False}
+    options |= {"append_images": images, "duration": duration, "loop": 0}
+    first.save(file, format=kind[1:].upper(), save_all=True, **options)
 
 
 def _write_mp4(file: BinaryIO, images: Iterator[Image.Image], fps: float) -> None:
