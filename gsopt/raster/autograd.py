@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -32,6 +33,9 @@ def draw(
     return _Draw.apply(backend, camera, settings, depth, background, *parameters)
 
 
+DIFFERENTIABLE = ("colors", "alphas", "depths")
+
+
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -44,7 +48,9 @@ class _Draw(torch.autograd.Function):
         *parameters: Tensor,
     ) -> Image:
         frame = backend.forward(Gaussians(*parameters), camera, settings, background, depth=depth)
-        ctx.backend, ctx.frame = backend, frame
+        # Aliases: what is returned gets ctx as its grad_fn, and a ctx that held it would never be freed.
+        kept = {name: None if (image := getattr(frame, name)) is None else image.detach() for name in DIFFERENTIABLE}
+        ctx.backend, ctx.frame = backend, replace(frame, **kept)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
         return frame.colors, frame.alphas, frame.depths, frame.radii
