@@ -23,13 +23,13 @@ DEFAULT_SETTINGS = RasterSettings()
 
 @dataclass(frozen=True)
 class Rendering:
-    """What C cameras saw."""
+    """The images of C cameras."""
 
     colors: Float[Tensor, "C H W 3"]
     """On the background that was given, else premultiplied."""
     alphas: Float[Tensor, "C H W 1"]
     depths: Float[Tensor, "C H W 1"] | None
-    """Expected depth along the viewing axis, scene units, 0 where nothing was hit; None unless asked for."""
+    """Expected depth along the viewing axis, scene units, 0 where nothing was hit; None unless requested."""
     radii: Int[Tensor, "C N 2"]
     """Half-extent of each splat in px; 0 where it is not in the image."""
 
@@ -83,7 +83,7 @@ def make_backend(name: str = "auto", threads: int = 0) -> Backend:
         module = importlib.import_module("gsopt.raster.cpu_backend")
     except ImportError as error:
         raise MissingDependency(
-            f"The backend {name!r} needs gsopt's compiled rasteriser, which is not built ({error}). "
+            f"The backend {name!r} needs gsopt's compiled rasterizer, which is not built ({error}). "
             "Build it in the source folder with: pip install -e ."
         ) from error
     backend: Backend = module.CpuBackend(threads)

@@ -33,9 +33,6 @@ def draw(
     return _Draw.apply(backend, camera, settings, depth, background, *parameters)
 
 
-DIFFERENTIABLE = ("colors", "alphas", "depths")
-
-
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -49,8 +46,9 @@ class _Draw(torch.autograd.Function):
     ) -> Image:
         frame = backend.forward(Gaussians(*parameters), camera, settings, background, depth=depth)
         # Aliases: what is returned gets ctx as its grad_fn, and a ctx that held it would never be freed.
-        kept = {name: None if (image := getattr(frame, name)) is None else image.detach() for name in DIFFERENTIABLE}
-        ctx.backend, ctx.frame = backend, replace(frame, **kept)
+        depths = None if frame.depths is None else frame.depths.detach()
+        kept = replace(frame, colors=frame.colors.detach(), alphas=frame.alphas.detach(), depths=depths)
+        ctx.backend, ctx.frame = backend, kept
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
         return frame.colors, frame.alphas, frame.depths, frame.radii

@@ -1,4 +1,4 @@
-"""What a rasteriser backend must offer, and how one is chosen.
+"""The protocol of a rasterizer backend, and the image model.
 
 A backend draws one camera at a time. `forward` returns a `RenderedFrame`, `backward` turns the gradient of a loss with
 respect to that frame into gradients of the parameters. The training loop calls these two directly; `rasterize`
@@ -8,14 +8,14 @@ The image model, which the float64 reference defines and every backend follows:
 
 * camera space t = viewmat · mean; a Gaussian is drawn when near_plane < t_z < far_plane.
 * cov2d = J W Σ Wᵀ Jᵀ + eps2d·I with J the Jacobian of the pinhole projection at t, its t_x/t_z and t_y/t_z clamped to
-  the view widened by 30 % of tan(fov/2) on either side (Zwicker 2001; Kerbl et al. 2023). Where det cov2d < 1e-12 px⁴
-  nothing is drawn; that takes an eps2d near 0.
+  the view widened by 30 % of tan(fov/2) on either side (Zwicker 2001; Kerbl et al. 2023). A splat of
+  det cov2d < 1e-12 px⁴ is not drawn; that takes an eps2d near 0.
 * opacity o = sigmoid(logit), times sqrt(max(0, det cov / det cov2d)) when antialiased (Yu et al. 2024).
-* alpha(p) = min(0.99, o · exp(-½ (p-mean2d)ᵀ cov2d⁻¹ (p-mean2d))), p the pixel centre; below 1/255 it contributes
-  nothing. Where alpha is clamped to 0.99 the gradient with respect to o and the exponent is zero: the true derivative.
+* alpha(p) = min(0.99, o · exp(-½ (p-mean2d)ᵀ cov2d⁻¹ (p-mean2d))), p the pixel center; below 1/255 it contributes
+  nothing. At the clamp to 0.99 the gradient with respect to o and the exponent is zero: the true derivative.
 * front to back by depth t_z, ties by index; a pixel takes no more once its transmittance T <= 1e-4.
-* colour = Σ T alpha c + T_final · background; alpha = 1 - T_final; depth = Σ T alpha t_z (not normalised).
-* c = max(0, 0.5 + Σ sh_k Y_k(d)), d the unit vector from the camera centre to the mean.
+* color = Σ T alpha c + T_final · background; alpha = 1 - T_final; depth = Σ T alpha t_z (not normalized).
+* c = max(0, 0.5 + Σ sh_k Y_k(d)), d the unit vector from the camera center to the mean.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DET_MIN = 1e-12
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """How Gaussians become pixels."""
+    """Settings of the image model."""
 
     sh_degree: int = 3
     """Highest band of the spherical harmonics that is evaluated (0-3)."""
@@ -60,13 +60,13 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """What one camera saw. Keeps, out of sight, what `backward` needs."""
+    """The image of one camera, and the state that `backward` needs."""
 
     colors: Float[Tensor, "H W 3"]
     """Composited on the background that was given, else premultiplied."""
     alphas: Float[Tensor, "H W"]
     depths: Float[Tensor, "H W"] | None
-    """Σ T alpha z, not normalised; None unless asked for."""
+    """Σ T alpha z, not normalized; None unless requested."""
     radii: Int[Tensor, "N 2"]
     """Half-extent of each splat's alpha >= 1/255 box in pixels, rounded up; 0 where it is not in the image."""
     context: object
@@ -83,11 +83,11 @@ class Gradients:
     logit_opacities: Float[Tensor, "N"]
     sh0: Float[Tensor, "N 1 3"]
     shN: Float[Tensor, "N K-1 3"] | None
-    """Rows of bands above the rendered sh_degree are zero. None when `backward` was told to leave it out."""
+    """Rows of bands above the rendered sh_degree are zero. None when `backward` had `bands=False`."""
     means2d: Float[Tensor, "N 2"]
     """dLoss/d(mean2d), 1/px: signed sum over pixels."""
     means2d_abs: Float[Tensor, "N 2"] | None
-    """The same with absolute values summed over pixels (AbsGS, Ye et al. 2024); None unless asked for."""
+    """The same with absolute values summed over pixels (AbsGS, Ye et al. 2024); None unless requested."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class AdamStep:
 
 
 class Backend(Protocol):
-    """A rasteriser, its photometric loss and its optimiser step: what runs once per training step."""
+    """A rasterizer, its photometric loss and its optimizer step: what runs once per training step."""
 
     name: str
 
@@ -144,8 +144,8 @@ class Backend(Protocol):
     ) -> Gradients:
         """Gradients of the parameters that `forward` drew. A frame can be used once.
 
-        `bands`: whether to write down the gradient of shN, three quarters of all numbers. Where no other gradient is
-        added to it `adam` does without.
+        `bands`: whether to write down the gradient of shN, three quarters of all numbers. `adam` does without where
+        no other gradient is added.
         `into`: gradients that nobody needs any more; a backend may overwrite and return them, which spares it fresh
         memory. They serve only while the number of Gaussians stays the same.
         """
@@ -169,7 +169,7 @@ class Backend(Protocol):
     ) -> None:
         """One Adam step in place, for gradients of a frame that `camera` drew with `settings`.
 
-        Where `gradients.shN` was left out they must be of that frame alone: it is the outer product
+        Without `gradients.shN` they must be of that frame alone: it is the outer product
         Y(direction of view) ⊗ gradients.sh0 / Y_0 then.
         """
         ...

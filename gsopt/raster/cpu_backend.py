@@ -22,8 +22,8 @@ GRADIENTS = tuple(field.name for field in fields(Gradients))
 
 
 def workspace(threads: int = 0) -> Any:
-    """What kernels run in: a pool of `threads` (0: one per core) and an instruction set, the best one or that which
-    the environment variable GSOPT_ISA (avx512, avx2, avx2x2, portable) names; UsageError if this processor lacks it."""
+    """Makes a pool of `threads` (0: one per core) and picks an instruction set, the best one or that which the
+    environment variable GSOPT_ISA (avx512, avx2, avx2x2, portable) names; UsageError if this processor lacks it."""
     try:
         return _cpu.Workspace(threads or _available_cores(), os.environ.get(ISA_VARIABLE, ""))
     except ValueError as error:
@@ -33,7 +33,7 @@ def workspace(threads: int = 0) -> Any:
 @dataclass
 class _Context:
     frame: Any
-    """None once its buffers were given back."""
+    """The kernels' buffers; None once given back."""
     model: Any
     gaussians: Gaussians
 
@@ -206,7 +206,7 @@ class _Views(dict[tuple[Any, ...], Any]):
 
 
 def _overwritable(gaussians: Gaussians, absgrad: bool, bands: bool, spent: Gradients | None) -> Gradients:
-    """`spent` where its tensors fit, else uninitialised ones."""
+    """`spent` where its tensors fit, else uninitialized ones."""
     if (
         spent is not None
         and spent.means.shape == gaussians.means.shape

@@ -1,4 +1,4 @@
-"""The rasteriser in plain torch: dense, slow, and the oracle every other backend is compared with.
+"""The rasterizer in plain torch: dense, slow, and the oracle every other backend is compared with.
 
 It computes in the dtype of the Gaussians (float64 for an oracle) and differentiates by autograd, so that nothing
 here shares a derivation with the compiled kernels. Every pixel meets every visible Gaussian: use it for small scenes.
@@ -47,7 +47,7 @@ class Splats:
     """The M Gaussians that touch the image, front to back."""
 
     rows: Int[Tensor, " M"]
-    """Which Gaussian each one is."""
+    """Index of the Gaussian."""
     means2d: Float[Tensor, "M 2"]
     conics: Float[Tensor, "M 3"]
     """Inverse of cov2d: xx, xy, yy, px^-2."""
@@ -55,7 +55,7 @@ class Splats:
     colors: Float[Tensor, "M 3"]
     depths: Float[Tensor, " M"]
     radii: Int[Tensor, "N 2"]
-    """Of all N Gaussians, in their own order."""
+    """Those of all N Gaussians, in their own order."""
 
 
 @dataclass
@@ -351,7 +351,7 @@ class ReferenceBackend:
 
 
 def _pixel_chunks(splats: Splats, height: int, width: int) -> Iterator[Float[Tensor, "P 2"]]:
-    """Pixel centres (x, y) in row order, as many at a time as memory allows."""
+    """Pixel centers (x, y) in row order, as many at a time as memory allows."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     centers = (torch.stack([x, y], dim=-1).view(-1, 2) + 0.5).to(splats.means2d)
     yield from centers.split(max(1, PAIRS_PER_CHUNK // max(1, len(splats.rows))))

@@ -1,4 +1,4 @@
-"""Small random scenes for the rasteriser's tests, and which of their pixels rounding cannot tip."""
+"""Small random scenes for the rasterizer's tests, and which of their pixels rounding cannot tip."""
 
 from __future__ import annotations
 

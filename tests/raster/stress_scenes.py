@@ -118,7 +118,7 @@ def at_the_rim() -> Case:
 
 
 ORIGIN = torch.tensor([1e6, -2e6, 1e6], dtype=torch.float64)
-"""Of a survey in metres, as national grids have it."""
+"""Of a survey in meters, as national grids have it."""
 
 
 def far_survey() -> Case:
@@ -131,7 +131,7 @@ def recentered_survey() -> Case:
 
 
 def survey(origin: Float[Tensor, "3"]) -> Case:
-    """A square kilometre seen from 3 km; `origin` is where its middle stands in the coordinates that are used."""
+    """A square kilometer seen from 3 km; `origin` is where its middle stands in the coordinates that are used."""
     parameters = crowd(log_scales=crowd()["log_scales"] + math.log(500), means=500 * crowd()["means"])
     eye = torch.tensor([[900.0, 1200.0, 2500.0]], dtype=torch.float64)
     viewmats = look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))

@@ -30,7 +30,7 @@ def draw(case: Case, background: bool = True) -> RenderedFrame:
 
 
 def on_axis(depths: list[float], logits: list[float], scale: float = 0.2, eps2d: float = 0.3) -> Case:
-    """Isotropic Gaussians on the optical axis of a 9x9 camera whose middle pixel's centre is the principal point."""
+    """Isotropic Gaussians on the optical axis of a 9x9 camera whose middle pixel's center is the principal point."""
     n = len(depths)
     gaussians = Gaussians(
         means=torch.tensor([[0.0, 0.0, z] for z in depths], dtype=torch.float64),

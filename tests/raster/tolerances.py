@@ -1,4 +1,4 @@
-"""Every tolerance of the rasteriser's tests, with its reason."""
+"""Every tolerance of the rasterizer's tests, with its reason."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ EXACT = 1e-11
 DIFFERENCE_STEP = 1e-5
 DIFFERENCE = 2e-7
 
-# A float32 image against the float64 one: a splat's centre at pixel 40 is known to 2e-6 px, its exponent (up to 5.5)
+# A float32 image against the float64 one: a splat's center at pixel 40 is known to 2e-6 px, its exponent (up to 5.5)
 # to some 1e-6, and up to 40 layers are added up. One part in 200 000 is far below one step of an 8-bit image (4e-3).
 IMAGE = 5e-6
 
-# The unnormalised depth of a float32 image, relative to the largest depth drawn: as IMAGE, one part in 200 000.
+# The unnormalized depth of a float32 image, relative to the largest depth drawn: as IMAGE, one part in 200 000.
 DEPTH = 5e-6
 
 # A float32 gradient against the float64 one, |difference| / |gradient| over a whole parameter tensor (L2): sums over
@@ -22,8 +22,8 @@ DEPTH = 5e-6
 GRADIENT = 1e-5
 
 # A drawn scene may hold one Gaussian whose gradient nearly cancels and has no relative error to speak of: there, this
-# share of the norm of the per-pixel magnitudes of dLoss/dmean2d is permitted on top. Moments about a tile's centre
-# that are moved to the centre of a narrow splat 8 px away lose (8 px / 1 px)² = 64 roundings of 6e-8.
+# share of the norm of the per-pixel magnitudes of dLoss/dmean2d is permitted on top. Moments about a tile's center
+# that are moved to the center of a narrow splat 8 px away lose (8 px / 1 px)² = 64 roundings of 6e-8.
 GRADIENT_FLOOR = 5e-6
 
 # The gradient of one needle (projected length : width above 10), relative to that needle's own: inverting its
@@ -55,5 +55,5 @@ SLANT = 2e-4
 SHEARED = 2e-3
 # Hundreds of equal layers round to the same side each time: some 1000 roundings of 6e-8 add up.
 MANY_LAYERS = 2e-4
-# 2e6 m from the origin neighbouring float32 numbers are 0.1 to 0.25 m apart; the splats are 100 m wide.
+# 2e6 m from the origin neighboring float32 numbers are 0.1 to 0.25 m apart; the splats are 100 m wide.
 FAR = 3e-3
