@@ -113,7 +113,7 @@ def use(graph: Graph, name: str, given: dict[str, Any]) -> dict[str, Value]:
 
 
 def camera_position(graph: Graph) -> Value:
-    """Of the scene's camera, in the splats' own frame."""
+    """Position of the scene's camera in the splats' own frame."""
     camera = graph.call("GeometryNodeInputActiveCamera", [])
     return graph.call("GeometryNodeObjectInfo", {"Object": camera}, "Location", transform_space="RELATIVE")
 
@@ -292,7 +292,7 @@ def column(graph: Graph, given: dict[str, Value]) -> tuple[Value, ...]:
 
 
 def ellipse(graph: Graph, given: dict[str, Value]) -> tuple[Value, ...]:
-    """Where the long axis of the covariance a, b, c points, and the variances along both."""
+    """Direction of the long axis of the covariance a, b, c, and the variances along both axes."""
     a, b, c = (given[name] for name in "ABC")
     half, middle = (a - c) * 0.5, (a + c) * 0.5
     spread = graph.math("SQRT", half * half + b * b)

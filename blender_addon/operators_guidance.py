@@ -180,7 +180,7 @@ class GSOPT_OT_reference_remove(ReportingOperator, bpy.types.Operator):
 
 
 def guidance(settings: Any, folder: Path) -> arguments.Guidance:
-    """What the panel says about guidance; its prompts are written into `folder`."""
+    """Returns the guidance options of the panel; its prompts are written into `folder`."""
     if settings.prior == "FOLDER" and not settings.prior_folder:
         raise UsageError("The prior is a folder, but none is chosen. Choose a model in diffusers' layout.")
     listed = document(settings).beside(folder)

@@ -193,7 +193,7 @@ class GSOPT_OT_look_through(ReportingOperator, bpy.types.Operator):
 
 
 def picture_size(camera: Any) -> tuple[int, int]:
-    """Of the input picture, px."""
+    """Size of the input image, px."""
     width, height = camera["gsopt_size"]
     pictures = [p.image for p in camera.data.background_images if p.image]
     return (width, height) if width and height else tuple(pictures[0].size) if pictures else (0, 0)
@@ -236,7 +236,7 @@ class GSOPT_OT_filter(ReportingOperator, bpy.types.Operator):
 
 
 def chosen_filter(settings: Any, thing: Any) -> statistics.Filter:
-    """What the panel says, in the splats' own frame."""
+    """Returns the panel's filters in the splats' own frame."""
     inverse = thing.matrix_world.inverted_safe()
     scale = inverse.to_scale().x
     box = None

@@ -74,7 +74,7 @@ def safe(thing: Any) -> str:
 
 
 def chosen_objects(context: Any) -> list[Any]:
-    """What is to be rendered. UsageError where there is nothing with a surface."""
+    """Returns the meshes to render. UsageError when there is nothing with a surface."""
     collection = context.scene.gsopt.collection
     among = collection.all_objects if collection else context.selected_objects
     solids = ("MESH", "CURVE", "SURFACE", "FONT", "META")
@@ -138,8 +138,8 @@ class GSOPT_OT_cancel(ReportingOperator, bpy.types.Operator):
             )
         entry = getattr(context.scene.gsopt, f"job_{self.kind}")
         job.end(job.read_job(Path(entry.folder)))
-        entry.state, entry.message = "NONE", "Cancelled."
-        return "Cancelled."
+        entry.state, entry.message = "NONE", "Canceled."
+        return "Canceled."
 
 
 CLASSES = (GSOPT_OT_test, GSOPT_OT_render_dataset, GSOPT_OT_find_poses, GSOPT_OT_cancel)

@@ -50,7 +50,7 @@ class GSOPT_UL_paths(Rows, bpy.types.UIList):
 
 
 class Sidebar:
-    """Where all panels stand."""
+    """Place of all panels."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -90,7 +90,7 @@ def values(layout: Any, owner: Any, *names: str) -> None:
 
 
 def show_job(layout: Any, entry: Any, kind: str) -> bool:
-    """How far a program is, or why it failed; whether it is going on."""
+    """Draws a program's progress, or why it failed; true while it runs."""
     if entry.state == "RUNNING":
         row = layout.row(align=True)
         row.progress(factor=entry.share, text=entry.message[:60] or "working ...")
@@ -301,7 +301,7 @@ def draw_display(layout: Any, thing: Any) -> None:
 
 
 def draw_colors(layout: Any, context: Any) -> None:
-    """What decides whether splats show their own colors: Blender's Solid view is grey, AgX is paler than the photos."""
+    """Draws what decides whether splats show their own colors: Solid view is gray, AgX paler than the photos."""
     shading, view = context.space_data.shading, context.scene.view_settings
     if shading.type in ("SOLID", "WIREFRAME"):
         row = layout.row()

@@ -1,4 +1,4 @@
-"""What belongs to the machine, not to the scene: the interpreter, where work is put, the language model's address."""
+"""Preferences of the machine, not of the scene: interpreter, work folder, the language model's address."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def absolute(path: str) -> Path:
 
 
 def work_folder(context: Any) -> Path:
-    """Where datasets, runs and logs go."""
+    """Returns the folder of datasets, runs and logs."""
     chosen = context.scene.gsopt.folder or preferences(context).folder
     if chosen:
         return absolute(chosen)

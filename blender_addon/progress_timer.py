@@ -59,7 +59,7 @@ def pick_up() -> None:
 
 
 def tick() -> float | None:
-    """One look at everything; None when there is nothing left to look at."""
+    """Polls everything once. Returns the pause until the next poll, None when nothing is left."""
     began = time.thread_time()
     busy = [look(scene) for scene in bpy.data.scenes]
     redraw()
@@ -71,7 +71,7 @@ def tick() -> float | None:
 
 
 def look(scene: Any) -> bool:
-    """Whether there is something to look at again. A defect of ours becomes a message, never the end of the timer."""
+    """Polls a scene; true when it must be polled again. A defect becomes a message and never stops the timer."""
     settings = scene.gsopt
     for step in (look_at_jobs, look_at_run, look_at_loading):
         try:
@@ -107,7 +107,7 @@ def assign_changed(entry: Any, **values: Any) -> None:
 
 
 def lasting(settings: Any) -> Iterator[tuple[Any, str]]:
-    """What no undo may take back, the state of runs and programs: owner and name of each property."""
+    """Yields owner and name of each property that no undo may take back: the state of runs and programs."""
     for name in settings.bl_rna.properties.keys():  # noqa: SIM118  a collection of Blender's
         if name.startswith("run_"):
             yield settings, name
@@ -184,7 +184,7 @@ def attach(scene: Any, run: Path, work: job.Job | None = None, told: int = 0) ->
 
 
 def follower(scene: Any) -> run_follower.Follower | None:
-    """That of the scene's run; made anew after a file was opened."""
+    """Returns the follower of the scene's run; creates it again after a file was opened."""
     settings = scene.gsopt
     if not settings.run_path or not settings.run_status:
         return None

@@ -1,4 +1,4 @@
-"""What the panel holds; it is saved in the .blend."""
+"""Properties of the panel; they are saved in the .blend."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ class GsoptScene(bpy.types.PropertyGroup):
 
 
 def blend_pictures(settings: Any) -> None:
-    """How much of the input picture shows through the scene's camera."""
+    """Apply the opacity of the input image to the scene's camera."""
     camera = settings.id_data.camera
     if camera is not None and camera.type == "CAMERA":
         for picture in camera.data.background_images:
@@ -193,7 +193,7 @@ def shows(name: str) -> Any:
 
 
 class GsoptObject(bpy.types.PropertyGroup):
-    """How one object's splats are shown."""
+    """Display of one object's splats."""
 
     run: StringProperty()  # type: ignore[valid-type]
     """Run directory or file they came from."""

@@ -25,7 +25,7 @@ HIDDEN = nodes.HIDDEN
 
 
 def is_splats(thing: Any) -> bool:
-    """Whether an object holds splats of ours."""
+    """True when an object holds splats of gsopt."""
     return bool(thing is not None and thing.type == "MESH" and thing.data.get(MARK))
 
 
@@ -44,7 +44,7 @@ def parts_of(splats: Splats) -> list[Part]:
 
 
 def mesh_in_steps(bpy: Any, name: str, parts: list[Part]) -> Iterator[Any]:
-    """A mesh made bit by bit, and before it the nodes and the material: None after every bit, so that a timer can pause
+    """Makes the nodes, the material and, bit by bit, the mesh: yields None after every bit, so that a timer can pause
     in between, then the mesh."""
     yield from (None for _ in nodes.node_groups(bpy))
     material = splat_material(bpy)

@@ -39,7 +39,7 @@ INTERRUPTED = 130
 
 
 def own_arguments(argv: Sequence[str]) -> list[str]:
-    """What was meant for this script: all after `--` inside Blender, all after the script's name otherwise."""
+    """Returns the arguments of this script: all after `--` inside Blender, all after the script's name otherwise."""
     if "--" in argv:
         return list(argv[argv.index("--") + 1 :])
     return list(argv[1:]) if argv and argv[0].endswith(".py") else []

@@ -1,4 +1,4 @@
-"""From what stands in the panel to argument lists: no shell, no quoting, every value its own word."""
+"""Turns the panel's settings into argument lists: no shell, no quoting, every value its own word."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Training:
-    """What `gsopt train` is asked for."""
+    """Options of `gsopt train`."""
 
     preset: str = ""
     """draft, default or high; empty: steps and size as given here."""
@@ -33,7 +33,7 @@ STEPS = {"draft": 2000, "default": 7000, "high": 15_000}
 
 @dataclass(frozen=True)
 class Guidance:
-    """What guides a run where the photos leave the scene open."""
+    """Options that guide a run where the photos leave the scene open."""
 
     prior: str = "auto"
     """auto (gsopt decides), off, embedded, sd21, or a folder or hub id."""
@@ -58,7 +58,7 @@ def train(python: Path, data: Path, run: Path, training: Training, guidance: Gui
 
 
 def own(training: Training) -> list[str]:
-    """What the panel shows in place of a preset."""
+    """Options that the panel offers in place of a preset."""
     words = ["--iterations", str(training.iterations), "--strategy", training.strategy]
     words += ["--background", training.background]
     words += ["--resolution", str(training.downscale)] if training.downscale > 1 else []
@@ -89,7 +89,7 @@ def poses(python: Path, photos: Path, out: Path, seed: int = 0, threads: int = 0
 
 @dataclass(frozen=True)
 class Writing:
-    """What `gsopt prompts` is asked for."""
+    """Options of `gsopt prompts`."""
 
     notes: str
     domain: str = "generic"
@@ -114,7 +114,7 @@ def doctor(python: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What scripts/synth_views.py is asked for."""
+    """Options of scripts/synth_views.py."""
 
     views: int = 50
     test_views: int = 10

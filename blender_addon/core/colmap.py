@@ -35,7 +35,7 @@ class Picture:
 
 
 def model_folder(data: Path) -> Path | None:
-    """Where the model lies, or None."""
+    """Returns the folder of the model, or None."""
     places = (data / "sparse" / "0", data / "sparse", data / "colmap" / "sparse" / "0")
     return next((place for place in places if (place / "images.bin").is_file()), None)
 

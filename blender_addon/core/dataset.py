@@ -1,4 +1,4 @@
-"""How far synth_views.py is, by the pictures it has written, and where its object lies in the scene it came from."""
+"""Progress of synth_views.py, by the images it has written, and the pose of its object in the original scene."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def failure(out: Path) -> str:
 
 
 def scene_from_dataset(data: Path) -> NDArray[np.float64] | None:
-    """[4, 4] from the dataset's frame back to the scene that was rendered; None where the dataset does not say."""
+    """Returns [4, 4] from the dataset's frame back to the rendered scene, or None when it is not recorded."""
     if not (data / RECORD).is_file():
         return None
     matrix: Any = read_json(data / RECORD).get("normalized_from_mesh")

@@ -1,4 +1,4 @@
-"""What the extension says when it cannot go on: what was wrong, what was got, what to do."""
+"""Errors of the extension: what was wrong, what was got, what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which Python has gsopt, and what `gsopt doctor` said there."""
+"""Finds the Python that has gsopt and reads the answer of its `gsopt doctor`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCRIPT = Path("scripts") / "synth_views.py"
 
 @dataclass(frozen=True)
 class Answer:
-    """What `gsopt doctor` found."""
+    """Findings of `gsopt doctor`."""
 
     version: str
     rasterizer: str
@@ -82,7 +82,7 @@ def checkout(interpreter: Path, preferred: str = "") -> Path:
 
 
 def read_answer(output: str, interpreter: str) -> Answer:
-    """What `gsopt doctor --json` printed. InputError when that Python has no gsopt, or one that is not known here."""
+    """Reads the output of `gsopt doctor --json`. InputError when that Python has no gsopt, or an unknown one."""
     start = output.find("{")
     try:
         found = json.loads(output[start:]) if start >= 0 else {}

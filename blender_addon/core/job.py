@@ -43,11 +43,11 @@ class Job:
     product: str = ""
     """The file or folder that it shall make."""
     total: int = 0
-    """Of what it makes one by one, such as pictures; 0 where that is not known."""
+    """Number of items it makes one by one, such as images; 0 when unknown."""
 
 
 def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """What another Python needs: nothing that Blender set for its own, output in UTF-8 and at once."""
+    """Environment of another Python: nothing that Blender set for its own, output in UTF-8 and at once."""
     kept = {k: v for k, v in environment.items() if not k.upper().startswith(FOREIGN)}
     for name in LOADER:
         if name in kept and "blender" in kept[name].lower():
@@ -105,7 +105,7 @@ def read_job(folder: Path) -> Job:
 
 
 def alive(job: Job) -> bool:
-    """Whether it still runs; another program that got the same process id does not count."""
+    """True while it runs; another program that got the same process id does not count."""
     child = _children.get(job.pid)
     if child is not None:
         return child.poll() is None
@@ -113,7 +113,7 @@ def alive(job: Job) -> bool:
 
 
 def process_alive(pid: int, started_before: float) -> bool:
-    """Whether the process with this id runs and was there at that time (seconds since 1970)."""
+    """True when the process with this id runs and existed at that time (seconds since 1970)."""
     child = _children.get(pid)
     if child is not None:
         return child.poll() is None
@@ -132,7 +132,7 @@ def process_alive(pid: int, started_before: float) -> bool:
 
 
 def birth(pid: int) -> float | None:
-    """When a process began, seconds since 1970; None where the system does not say, infinity for one that has ended
+    """Returns when a process began, seconds since 1970; unknown is None, infinity stands for one that has ended
     and only waits to be noticed by its parent."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()

@@ -52,7 +52,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Element:
-    """What a header says about one element."""
+    """Header of one element."""
 
     name: str
     count: int

@@ -1,6 +1,6 @@
 """prompts.json, the file that `gsopt prompts` writes and `gsopt train --prompts` reads (its schema is gsopt's).
 
-What the file holds beside its prompts (notes, domain, how they were made, images) is kept and written back.
+Everything beside the prompts (notes, domain, how they were made, images) is kept and written back.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Prompt:
     text: str
     weight: float = 1.0
     view: str = "all"
-    """From where the object looks like this."""
+    """Side of the object that the prompt describes."""
     polarity: str = "positive"
     source: str = "user"
     """user, template or llm:MODEL."""

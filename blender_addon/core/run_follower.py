@@ -31,7 +31,7 @@ LONGEST = 500
 
 @dataclass
 class Run:
-    """What is known about a run."""
+    """State of a run as read so far."""
 
     path: Path
     status: str = "waiting"
@@ -145,13 +145,13 @@ class Follower:
             run.say("It has said nothing for a long time and seems to have ended before its first step. See its log.")
 
     def _goes_on(self) -> bool:
-        """Whether the process lives; where the reader skipped its name, whether it said something of late."""
+        """True while the process lives; when the reader skipped its id, true while the run writes events."""
         if self.run.pid:
             return jobs.process_alive(self.run.pid, self.run.began)
         return time.time() - changed(self.run.path / "events.jsonl") < SILENCE
 
     def _more(self) -> bool:
-        """Whether the process wrote something between the last read and its end."""
+        """True when the process wrote something between the last read and its end."""
         try:
             return (self.run.path / "events.jsonl").stat().st_size > self._offset and self._read_rest()
         except OSError:
@@ -204,7 +204,7 @@ def inside(run: Path, name: Any) -> str:
 
 
 def changed(path: Path) -> float:
-    """When a file, or a folder's list of files, was changed, seconds since 1970; now, where that is not known."""
+    """Time of the last change of a file or of a folder's list, seconds since 1970; now when unknown."""
     try:
         return path.stat().st_mtime
     except OSError:

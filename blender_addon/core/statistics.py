@@ -1,4 +1,4 @@
-"""What the Inspect panel says about splats, and which of them its filters keep."""
+"""Statistics of splats for the Inspect panel, and the splats that its filters keep."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Summary:
-    """What can be said about splats at a glance."""
+    """Statistics of a set of splats."""
 
     count: int
     sh_degree: int
@@ -84,7 +84,7 @@ def bars(values: Any, edges: Any) -> tuple[Bar, ...]:
 
 @dataclass(frozen=True)
 class Filter:
-    """What is kept; a limit that is None does not bind."""
+    """Limits of the splats that are kept; no limit binds where the value is None."""
 
     opacity: tuple[float, float] = (0.0, 1.0)
     largest_scale: float | None = None

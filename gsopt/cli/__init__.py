@@ -70,7 +70,7 @@ def run_verb(verb: str, arguments: Sequence[str]) -> int:
 
 
 def exit_code(stop: SystemExit) -> int:
-    """What the interpreter would answer with: 0 for None, the number, or 1 after printing a text."""
+    """Returns the interpreter's exit code: 0 for None, the number, or 1 after printing a text."""
     if isinstance(stop.code, str):
         print(stop.code, file=sys.stderr)
         return 1
@@ -78,7 +78,7 @@ def exit_code(stop: SystemExit) -> int:
 
 
 def unknown_verb(verb: str) -> str:
-    """What was wrong, what was got and the verbs that come closest."""
+    """Returns the error for an unknown verb, with the verbs that come closest."""
     if not verb:
         return f"A verb is needed, got none. Give one of {', '.join(VERBS)}; `gsopt --help` explains them."
     close = difflib.get_close_matches(verb, VERBS, n=2, cutoff=0.5)

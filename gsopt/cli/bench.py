@@ -24,7 +24,7 @@ class Kernels:
     """Time the compiled kernels in full training iterations and write one record per case."""
 
     json: Annotated[Path, arg(metavar="FILE")]
-    """Result file. What it holds of other cases and parts is kept."""
+    """Result file. Its records of other cases and parts are kept."""
     case: Annotated[tuple[str, ...], arg(metavar="WxH/N")] = (
         "200x200/20k",
         "400x400/50k",
@@ -47,7 +47,7 @@ class Scenes:
     run."""
 
     json: Annotated[Path, arg(metavar="FILE")]
-    """Result file. What it holds of other scenes and runs is kept."""
+    """Result file. Its records of other scenes and runs are kept."""
     data: Annotated[Path | None, arg(metavar="DATA")] = None
     """Dataset folder; the scene that ships with gsopt when not given."""
     resolution: Annotated[int, arg(aliases=["-r"])] = 1
@@ -69,7 +69,7 @@ class Draw:
     """Write the tables and charts of a page from a result file, without measuring anything."""
 
     json: Annotated[Path, arg(metavar="FILE")]
-    """What `gsopt bench kernels`, `gsopt bench scenes` or `gsopt bench --suite` wrote."""
+    """Result file of `gsopt bench kernels`, `gsopt bench scenes` or `gsopt bench --suite`."""
     page: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/performance.md")
     """The page that has the block `kernels`, `scenes` or that of the suite (docs/results.md); charts go to img/ beside
     it, of a suite a page with pictures too."""
@@ -92,7 +92,7 @@ class Suite:
     groups: Annotated[tuple[str, ...], arg(metavar="GROUP")] = ()
     """Parts of the suite, in its own order; all when not given."""
     threads: int = 1
-    """Of every run. The figures do not depend on it."""
+    """Threads of every run. The figures do not depend on it."""
     prior: Annotated[str, arg(metavar="PRIOR")] = ""
     """Guides the guided arms, as `gsopt train --prior`; gsopt's own choice when not given."""
     llm: Annotated[str, arg(metavar="URL")] = ""

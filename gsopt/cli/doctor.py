@@ -43,7 +43,7 @@ class Package:
     extra: str
     """The extra of gsopt it belongs to; empty for what is always needed."""
     version: str | None
-    """None when it is not installed."""
+    """Installed version, or None when it is missing."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def examine() -> dict[str, Any]:
 
 
 def required_packages() -> list[Package]:
-    """What gsopt's own metadata asks for, with the versions found; empty when gsopt itself is not installed."""
+    """Returns the packages that gsopt's metadata requires, with their versions; empty when gsopt is not installed."""
     try:
         lines = metadata.requires("gsopt") or []
     except metadata.PackageNotFoundError:
@@ -151,7 +151,7 @@ def measure(backend: Backend) -> float:
 
 
 def find_lpips_vgg() -> dict[str, str | None]:
-    """Where the weights of LPIPS (VGG) are, or why there are none."""
+    """Returns the path of the LPIPS (VGG) weights, or why there are none."""
     try:
         from gsopt.metrics import VGG_NOTE, find_vgg_weights
 
@@ -169,7 +169,7 @@ def text(findings: dict[str, Any]) -> str:
     for package in findings["packages"]:
         extra = f" [{package['extra']}]" if package["extra"] else ""
         lines.append(f"  {package['name'] + extra:<24} {package['version'] or 'not installed'}")
-    lines += ["", "rasteriser", *rasterizer_lines(findings["rasterizer"]), "", "LPIPS (VGG) weights"]
+    lines += ["", "rasterizer", *rasterizer_lines(findings["rasterizer"]), "", "LPIPS (VGG) weights"]
     lines.append(f"  {findings['lpips_vgg']['path'] or findings['lpips_vgg']['problem']}")
     if findings["missing_extras"]:
         lines += ["", "to install what is missing"]

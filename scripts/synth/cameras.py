@@ -1,4 +1,4 @@
-"""Where the views of an object stand. numpy only.
+"""Cameras of the views of an object. numpy only.
 
 Poses are world_from_cam in the axes of NeRF-synthetic and Blender (x right, y up, looking along -z), world z up.
 """
@@ -34,7 +34,7 @@ class Shot:
     focal: float
     """px; pixels are square."""
     center: tuple[float, float]
-    """Principal point, px; the centre of pixel (i, j) is (i + 0.5, j + 0.5)."""
+    """Principal point, px; the center of pixel (i, j) is (i + 0.5, j + 0.5)."""
 
     @property
     def eye(self) -> Float[np.ndarray, "3"]:
@@ -137,7 +137,7 @@ def frame_names(split: str, count: int) -> list[str]:
 
 
 def shots_of_file(path: Path, settings: Settings) -> list[Shot]:
-    """The poses of a transforms.json, in the world of the normalised object; lens and size are those of `settings`.
+    """The poses of a transforms.json, in the world of the normalized object; lens and size are those of `settings`.
 
     InputError for a file without rigid poses.
     """

@@ -83,13 +83,13 @@ def view_caption(caption: str, shot: Shot, front: tuple[float, float] | None) ->
 
 
 def side_of(eye: Float[np.ndarray, "3"], front: tuple[float, float]) -> str:
-    """Which of its sides the object shows to a camera at `eye`."""
+    """Returns the side of the object that faces a camera at `eye`."""
     turn = math.degrees(math.atan2(eye[1], eye[0]) - math.atan2(front[1], front[0])) % 360.0
     return ("front", "left side", "back", "right side")[int((turn + 45.0) // 90.0) % 4]
 
 
 def count_colors(rgba: UInt8[np.ndarray, "H W 4"]) -> dict[str, int]:
-    """How many opaque pixels are nearest to each color of the palette (in coded values, hue weighing double)."""
+    """Counts the opaque pixels nearest to each color of the palette (in coded values, hue weighing double)."""
     seen = rgba[rgba[..., 3] > 127][::7, :3].astype(np.float64)
     shades = opponent(np.array([rgb for _, rgb in PALETTE], float))
     nearest = np.linalg.norm(opponent(seen)[:, None] - shades, axis=2).argmin(axis=1)

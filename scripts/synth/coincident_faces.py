@@ -1,4 +1,4 @@
-"""Sheets that are modelled from both sides in one plane: each side would shadow the other, so they are parted."""
+"""Separates the two sides of sheets modeled in one plane, because each would shadow the other."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 GAP = 1e-4
-"""How far each side moves outward, share of the mesh's extent: a fortieth of a pixel when it fills 256 pixels."""
+"""Distance that each side moves outward, share of the mesh's extent: a fortieth of a pixel when it fills 256 pixels."""
 TOUCH = 1e-5
 """Sides closer than this, in the same measure, lie in one plane."""
 OPPOSITE = -0.999
@@ -20,7 +20,7 @@ OPPOSITE = -0.999
 def separate_coincident_faces(shape: Any) -> int:
     """Move faces that lie on a face of opposite normal outward by `GAP`; returns how many there are.
 
-    Modelling tools close sheets so, often with other triangles on either side. A renderer's shadow rays start on one
+    Modeling tools close sheets so, often with other triangles on either side. A renderer's shadow rays start on one
     side and end at once on the other: black. Corners that both sides share stay where they are.
     """
     from mathutils.bvhtree import BVHTree

@@ -32,7 +32,7 @@ class ImportedMesh:
     triangles: Float[np.ndarray, "T 3 3"]
     """World corners of every triangle."""
     normalized_from_mesh: Float[np.ndarray, "4 4"]
-    """World from the file's coordinates; for FBX and .blend from those that Blender reads (metres, z up)."""
+    """World from the file's coordinates; for FBX and .blend from those that Blender reads (meters, z up)."""
     warnings: list[str]
 
 
@@ -148,8 +148,8 @@ def load_image(bpy: Any, file: Path) -> Any:
     return image if image.size[0] else None
 
 
-class Mended(NamedTuple):
-    """What was done to the normals of a mesh."""
+class NormalRepair(NamedTuple):
+    """Changes to the normals of a mesh."""
 
     turned: bool = False
     """Faces were turned."""
@@ -157,7 +157,7 @@ class Mended(NamedTuple):
     """Corners whose normal was replaced."""
 
 
-def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> Mended:
+def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> NormalRepair:
     """Normals that would shade black are replaced.
 
     Neighbors that wind opposite ways (ShapeNet stores faces from both sides, importers keep one at random) are turned
@@ -165,7 +165,7 @@ def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> Mended:
     A mesh of a kind without shading of its own and without normals becomes smooth where faces meet gently.
     """
     if not len(shape.polygons):
-        return Mended()
+        return NormalRepair()
     corners = integers(shape.loops, "vertex_index")
     sizes = integers(shape.polygons, "loop_total")
     turned = winding_disagrees(corners, sizes)
@@ -177,17 +177,17 @@ def mend_normals(bpy: Any, shape: Any, unshaded: bool) -> Mended:
                 bpy.ops.mesh.customdata_custom_splitnormals_clear()
         shape.polygons.foreach_set("use_smooth", np.ones(len(shape.polygons), bool))
         shape.set_sharp_from_angle(angle=SMOOTH_BELOW)
-        return Mended(turned)
+        return NormalRepair(turned)
     if not shape.has_custom_normals:
-        return Mended()
+        return NormalRepair()
     normals = vectors(shape.corner_normals, "vector")
     faces = np.repeat(area_vectors(vectors(shape.vertices, "co")[corners], sizes), sizes, axis=0)
     wrong = ~((normals * faces).sum(axis=1) > 0.0) & faces.any(axis=1)
     if not wrong.any():
-        return Mended()
+        return NormalRepair()
     normals[wrong] = faces[wrong] / np.linalg.norm(faces[wrong], axis=1, keepdims=True)
     shape.normals_split_custom_set(normals.tolist())
-    return Mended(wrong=int(wrong.sum()))
+    return NormalRepair(wrong=int(wrong.sum()))
 
 
 def winding_disagrees(corners: Int[np.ndarray, "L"], sizes: Int[np.ndarray, "F"]) -> bool:

@@ -1,4 +1,4 @@
-"""Which meshes a run renders and what is known about them: files, folders, ShapeNet, manifests."""
+"""The meshes a run renders and what is known about them: files, folders, ShapeNet, manifests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from synth.meshfile import mesh_files
 
 MAX_LIST_BYTES = 1 << 30
 SHAPENET_MESHES = ("models/model_normalized.obj", "model.obj")
-"""Where the model lies in its folder: ShapeNetCore.v2, v1."""
+"""Path of the model in its folder: ShapeNetCore.v2, v1."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Item:
     creator: str | None = None
     caption: str | None = None
     front: tuple[float, float] | None = None
-    """Where its front looks, as x and y of the world; None where the source does not say."""
+    """Direction of its front, as x and y of the world, or None when unknown."""
 
     @property
     def noun(self) -> str:
-        """What to call it: the name, else the category."""
+        """Noun for captions: the name, else the category."""
         return self.name or self.category or "object"
 
     def known(self) -> dict[str, Any]:

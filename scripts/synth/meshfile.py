@@ -218,7 +218,7 @@ def check_gltf_document(mesh: Path, text: bytes, inside: int) -> list[str]:
 
 
 def buffer_bytes(mesh: Path, buffer: dict[str, Any], inside: int) -> int:
-    """How many bytes a buffer really has."""
+    """Returns the true number of bytes of a buffer."""
     uri = buffer.get("uri")
     if uri is None:
         return inside

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 CANDIDATES = 4
 """Samples drawn for each point wanted: those that no view sees are dropped."""
 DEPTH_TOLERANCE = 0.01
-"""How far off the depth map a sample may lie and count as seen, world units."""
+"""Largest distance from the depth map at which a sample counts as visible, world units."""
 GRAZING = 0.2
 """A view that sees the surface at less than this cosine tells neither its color nor whether it is hidden."""
 

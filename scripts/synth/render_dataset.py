@@ -37,7 +37,7 @@ def run(
 ) -> int:
     """Render every item into `out / item.id` and return the exit code: 0, or 3 when any failed.
 
-    What `out` already holds of the same run is kept and not rendered again with `resume`. InputError when `out` holds
+    With `resume`, objects that `out` already holds of the same run are kept. InputError when `out` holds
     anything else, or when a file that the settings name cannot be read; nothing in `out` is touched then.
     """
     began = time.perf_counter()
@@ -153,7 +153,7 @@ def records(out: Path) -> Iterator[dict[str, Any]]:
 
 
 def timings(outcomes: Sequence[Outcome], seconds: float) -> dict[str, Any]:
-    """How long this invocation took; apart from dataset.json, which is the same whenever the run is."""
+    """Returns the times of this invocation; dataset.json has none, so that equal runs write equal files."""
     done = {o.job.item.id: o.seconds for o in outcomes if o.seconds is not None}
     total = {stage: sum(s[stage] for s in done.values()) for stage in ("stage", "render", "write")}
     return {"wall_seconds": seconds, "objects": len(done), "seconds_in_workers": total, "by_object": done}

@@ -51,7 +51,7 @@ class Timing:
 
 @dataclass
 class Views:
-    """What is gathered while the views of an object are rendered."""
+    """Data gathered while the views of an object are rendered."""
 
     points: SurfacePoints | None
     colors: list[dict[str, int]] = field(default_factory=list)
@@ -196,7 +196,7 @@ def describe(
     gathered: Views,
     renderer: str,
 ) -> dict[str, Any]:
-    """The record of an object: what it is, how it was rendered, and how to undo the normalisation."""
+    """The record of an object: what it is, how it was rendered, and how to undo the normalization."""
     caption = captions.object_caption(item, captions.total_colors(gathered.colors))
     return item.known() | {
         "caption": caption,

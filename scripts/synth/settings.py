@@ -1,4 +1,4 @@
-"""What a run renders: plain values, checked once. Equal settings are equal files."""
+"""Settings of a run: plain values, checked once. Equal settings are equal files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ELEVATIONS: dict[str, tuple[float, float]] = {
 }
 """Lowest and highest elevation of a layout when none is given, degrees."""
 BOUND = {"sphere": 1.0, "cube": 0.5 * math.sqrt(3.0)}
-"""Radius of the sphere around the origin that a normalised object stays within."""
+"""Radius of the sphere around the origin that a normalized object stays within."""
 MARGIN = 0.96
 """Share of the frame that this sphere spans at the default distance."""
 COLORS = {"white": (255, 255, 255), "black": (0, 0, 0), "gray": (128, 128, 128)}
@@ -36,7 +36,7 @@ COLORS = {"white": (255, 255, 255), "black": (0, 0, 0), "gray": (128, 128, 128)}
 
 @dataclass(frozen=True)
 class Settings:
-    """What to photograph, from where and how finely."""
+    """Views to render: their cameras, resolution and outputs."""
 
     views: int = 50
     """Input views."""
@@ -53,7 +53,7 @@ class Settings:
     camera_file: str | None = None
     """With layout `file`: a transforms.json whose poses are taken; a frame may name its `split`."""
     radius: float | None = None
-    """Distance of the cameras from the origin; by default the normalised object just fits the frame."""
+    """Distance of the cameras from the origin; by default the normalized object just fits the frame."""
     fov: float = 40.0
     """Horizontal field of view, degrees."""
     lens_jitter: float = 0.0
@@ -61,9 +61,9 @@ class Settings:
     samples: int = 32
     """Light paths per pixel."""
     engine: Engine = "cycles"
-    """cycles traces rays; workbench is a fast draft of the colours only."""
+    """cycles traces rays; workbench is a fast draft of the colors only."""
     lighting: Lighting = "studio"
-    """studio: soft lamps fixed in the world; flat: bare surface colours; hdri: an environment image."""
+    """studio: soft lamps fixed in the world; flat: bare surface colors; hdri: an environment image."""
     hdri: str | None = None
     """The environment image of `hdri` lighting."""
     background: str = "transparent"
@@ -71,17 +71,17 @@ class Settings:
     normalize: Normalize = "sphere"
     """The object fills the unit sphere, or the cube of side 1 around the origin."""
     depth: bool = False
-    """depth/*.npy: float32 camera z at the pixel centre, world units, 0 where there is nothing."""
+    """depth/*.npy: float32 camera z at the pixel center, world units, 0 where there is nothing."""
     normals: bool = False
     """normal/*.npy: float16 world shading normals, facing the camera, 0 where there is nothing."""
     masks: bool = False
-    """mask/*.png: 255 where the pixel centre sees the object; alpha/*.png: share of the pixel that it covers."""
+    """mask/*.png: 255 where the pixel center sees the object; alpha/*.png: share of the pixel that it covers."""
     position: bool = False
-    """position/*.npy: float32 world position at the pixel centre, 0 where there is nothing."""
+    """position/*.npy: float32 world position at the pixel center, 0 where there is nothing."""
     formats: tuple[Format, ...] = ("nerf",)
-    """Which descriptions of the cameras are written; they share the images."""
+    """Formats of the cameras to write; they share the images."""
     points: int = 0
-    """Coloured surface samples, as points3d.ply and COLMAP points3D."""
+    """Colored surface samples, as points3d.ply and COLMAP points3D."""
     captions: bool = False
     """captions.json: a sentence for the object and one for every view."""
     preview: bool = False
@@ -133,7 +133,7 @@ class Settings:
 
     @property
     def bound(self) -> float:
-        """Radius around the origin that the normalised object stays within."""
+        """Radius around the origin that the normalized object stays within."""
         return BOUND[self.normalize]
 
     @property
@@ -143,7 +143,7 @@ class Settings:
 
     @property
     def distance(self) -> float:
-        """Of the cameras from the origin: `radius`, or where the bound just fits the frame, whatever the jitter.
+        """Distance of the cameras from the origin: `radius`, or the one at which the bound just fits the frame.
 
         The outline of a sphere of radius r seen from distance d has the tangent r / sqrt(d² - r²) to the axis.
         """
@@ -155,7 +155,7 @@ class Settings:
 
     @property
     def background_rgb(self) -> tuple[int, int, int] | None:
-        """sRGB-coded color behind the object; None keeps the images transparent. UsageError for an unknown name."""
+        """sRGB-coded color behind the object, or None for transparent images. UsageError for an unknown name."""
         if self.background == "transparent":
             return None
         if re.fullmatch("#[0-9a-fA-F]{6}", self.background):
@@ -169,6 +169,6 @@ class Settings:
         return self.depth or self.masks or self.position or self.normals or self.points > 0
 
     def record(self) -> dict[str, Any]:
-        """What decides the files: all but the number of threads, as JSON has it."""
+        """Returns the settings that decide the files: all but the number of threads, as JSON has it."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "threads"}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

@@ -41,7 +41,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a job went: seconds of each stage, or why there is no object."""
+    """Outcome of a job: seconds of each stage, or why there is no object."""
 
     job: Job
     seconds: dict[str, float] | None = None

@@ -57,7 +57,7 @@ def box(things: list[Any]) -> Any:
 
 
 def misplaced(splats: Any) -> float:
-    """How far the box of the splats is from that of the meshes they were learned from, as a share of its size."""
+    """Distance of the splats' box from the box of their meshes, as a share of its size."""
     meshes = box([o for o in bpy.context.scene.objects if o.type == "MESH" and not splat_object.is_splats(o)])
     return float(np.abs(box([splats]) - meshes).max() / np.ptp(meshes, axis=0).max())
 

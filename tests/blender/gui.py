@@ -35,7 +35,7 @@ PATIENCE = 900.0
 SAMPLING = 40.0
 """Seconds for a viewport to gather its samples."""
 STEPS, ENOUGH = 10_000, 1000
-"""Of the run, and after which it is stopped: it must not end before the slowest window has shown it."""
+"""Steps of the run, and the step after which it is stopped: it must not end before the slowest window has shown it."""
 WRITTEN = {
     "front": [{"text": "a russet hen with a red comb, seen from the front", "why": "named in the notes"}],
     "back": [{"text": "the tail of a hen, dark green feathers", "why": "No photo shows the back."}],

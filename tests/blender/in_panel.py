@@ -1,4 +1,4 @@
-"""What tests of the panel do again and again."""
+"""Steps that tests of the panel share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def bring_in(path: Path, count: int = 100) -> Any:
 
 
 def fails_with(said: str, operator: Any, **settings: Any) -> None:
-    """The operator is cancelled with a message in the panel; in a script that is a RuntimeError."""
+    """The operator is canceled with a message in the panel; in a script that is a RuntimeError."""
     import bpy
 
     with pytest.raises(RuntimeError, match="Error: "):

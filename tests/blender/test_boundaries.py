@@ -1,4 +1,4 @@
-"""What may import what: the run directory is all that the extension and gsopt share, and `core` needs no Blender."""
+"""Import rules: the run directory is all that the extension and gsopt share, and `core` needs no Blender."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ LEAVE = "import os, runpy, sys; runpy.run_path(sys.argv[1], run_name='__main__')
 
 
 def found_by(python: str, script: str, work: Path, *words: str) -> dict[str, Any]:
-    """What a script of this folder found in a Blender of its own."""
+    """Returns the findings of a script of this folder, run in a Blender of its own."""
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(work)}
     command = [python, "-c", LEAVE, str(HERE / script), "--", *words]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, encoding="utf-8")

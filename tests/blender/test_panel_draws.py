@@ -48,7 +48,7 @@ class Layout:
 
 
 class Settings:
-    """What a button is given; only properties that its operator has."""
+    """Properties passed to a button; only properties that its operator has."""
 
     def __init__(self, known: set[str]) -> None:
         object.__setattr__(self, "known", known)
@@ -91,7 +91,7 @@ def test_work_that_goes_on_draws_with_its_progress(panel: Any) -> None:
     text = drawn()
     for said in ("half of the import", "250 of 1,000", "PSNR 24.50 dB", "1:15 left", "4,321 Gaussians", "few views"):
         assert said in text
-    assert "Material Preview" in text, "Solid view is grey"
+    assert "Material Preview" in text, "Solid view is gray"
     assert "Standard" in drawn("MATERIAL") or panel.id_data.view_settings.view_transform == "Standard"
 
 

@@ -140,7 +140,7 @@ def test_poses_are_found_or_the_reason_is_told(panel: Any, tmp_path: Path) -> No
     assert (Path(panel.dataset) / "transforms.json").is_file()
 
 
-def test_work_can_be_cancelled_and_is_not_begun_twice(panel: Any, tmp_path: Path) -> None:
+def test_work_can_be_canceled_and_is_not_begun_twice(panel: Any, tmp_path: Path) -> None:
     import bpy
 
     from blender_addon.core import job

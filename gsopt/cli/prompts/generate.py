@@ -26,13 +26,13 @@ class Flags:
     through a file again, `gsopt prompts compare DATA FILE ...` tries files on a scene."""
 
     notes: Annotated[str, arg(metavar="TEXT")]
-    """What the object is, in the expert's words; best in English, the object first: "femur, osteoporotic, CT"."""
+    """Description of the object in the expert's words; best in English, the object first: "femur, osteoporotic, CT"."""
     domain: Annotated[str, arg(metavar="NAME|FILE")] = "generic"
     """generic, medicine, robotics, arvr, environment, or a template of your own (Markdown)."""
     images: Annotated[tuple[Path, ...], arg(metavar="PATH ...")] = ()
     """Photos, folders of photos or a dataset: for models that see, and to score the prompts."""
     category: Annotated[str, arg(metavar="NOUN")] = ""
-    """What the object is called; found in the notes when not given."""
+    """Noun for the object; found in the notes when not given."""
     n: Annotated[int, arg(aliases=["-n"], metavar="N")] = 8
     """Prompts to write beside the expert's own words; from 6 on one each is for front, side, back and top."""
     negatives: Annotated[int, arg(metavar="N")] = 3
@@ -45,15 +45,15 @@ class Flags:
     timeout: Annotated[float, arg(metavar="SECONDS")] = 120.0
     """For all requests to the server together."""
     temperature: float = 0.8
-    """Of the language model; 0 always takes the likeliest word."""
+    """Temperature of the language model; 0 always takes the likeliest word."""
     seed: int = 0
     """For the language model, where it takes one, and for pictures."""
     price: Annotated[str, arg(metavar="IN,OUT")] = ""
-    """Price of a million tokens in and out, to be told the cost."""
+    """Price of a million tokens in and out, to print the cost."""
     fallback: tyro.conf.FlagCreatePairsOff[bool] = False
     """Let the template step in where the model cannot be had or gives nothing usable; the file says so."""
     prior: Annotated[str, arg(metavar="PRIOR")] = "auto"
-    """Whose tokenizer counts, whose CLIP scores, whose pipeline draws: embedded, sd21, a diffusers folder, a hub id."""
+    """Prior whose tokenizer, CLIP and pipeline are used: embedded, sd21, a diffusers folder, a hub id."""
     clip: Annotated[str, arg(metavar="FOLDER")] = ""
     """A CLIP model that scores the prompts, where the prior has none."""
     review: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -63,7 +63,7 @@ class Flags:
     image_steps: int = 25
     """Denoising steps of such an image."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="FILE")] = Path("prompts.json")
-    """Where the prompts go; a model's answers go to FILE.raw.json beside it."""
+    """File to write; a model's answers go to FILE.raw.json beside it."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace the file if it exists."""
 
@@ -102,7 +102,7 @@ def write(flags: Flags) -> int:
 
 
 def read_job(flags: Flags) -> Job:
-    """What is to be made."""
+    """Returns the job that the flags describe."""
     from gsopt.llm_prompts.generate import Job
 
     return Job(
@@ -153,8 +153,8 @@ def spent(result: Result, prices: tuple[float, float] | None) -> str:
     """Requests, tokens, time and cost of the model."""
     assert result.talk is not None
     taken, given = result.talk.tokens
-    counted = [f"{taken:,} tokens in" if taken is not None else "tokens in not told"]
-    counted.append(f"{given:,} out" if given is not None else "out not told")
+    counted = [f"{taken:,} tokens in" if taken is not None else "tokens in unknown"]
+    counted.append(f"{given:,} out" if given is not None else "out unknown")
     cost = "cost unknown (give --price IN,OUT)"
     if prices is not None and taken is not None and given is not None:
         cost = f"cost {(taken * prices[0] + given * prices[1]) / 1e6:.4f}"
@@ -165,7 +165,7 @@ def spent(result: Result, prices: tuple[float, float] | None) -> str:
 
 
 def read_prices(text: str) -> tuple[float, float] | None:
-    """IN,OUT as two numbers; None for nothing."""
+    """Returns IN,OUT as two numbers, or None for an empty text."""
     if not text:
         return None
     try:

@@ -168,7 +168,7 @@ def test_shapenet_comes_textured_and_flat_light_keeps_its_colors(bpy: Any, shape
     assert counts.max() / counts.sum() > 0.8
 
 
-def test_a_sheet_modelled_from_both_sides_is_lit_on_both(bpy: Any, tmp_path: Path) -> None:
+def test_a_sheet_modeled_from_both_sides_is_lit_on_both(bpy: Any, tmp_path: Path) -> None:
     """Front and back lie in one plane, cut into triangles along different diagonals."""
     square = "v -1 0 -1\nv 1 0 -1\nv 1 0 1\nv -1 0 1\n"
     (tmp_path / "sheet.obj").write_text(f"{square}{square}f 3 2 1\nf 4 3 1\nf 5 6 8\nf 6 7 8\n")
@@ -248,7 +248,7 @@ def test_every_format_comes_in_at_the_same_place(bpy: Any, suffix: str, two_ball
     for bound in (np.min, np.max):
         extreme = [bound(imported.triangles.reshape(-1, 3), axis=0) for imported in (before, after)]
         assert np.allclose(*extreme, atol=1e-5)
-    # The copy is of the normalised mesh: nothing but the change of axes is left to do; the source was larger.
+    # The copy is of the normalized mesh: nothing but the change of axes is left to do; the source was larger.
     assert np.allclose(np.linalg.det(after.normalized_from_mesh), 1.0, atol=1e-4)
     assert np.linalg.det(before.normalized_from_mesh) < 0.5
 

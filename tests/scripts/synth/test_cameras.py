@@ -102,7 +102,7 @@ def test_a_camera_over_the_pole_is_still_a_rotation() -> None:
 def test_nothing_is_cut_off_at_the_default_distance(
     fov: float, jitter: float, size: tuple[int, int], normalize: Any, seed: int
 ) -> None:
-    """The outline of the bounding sphere stays in every frame: any lens, aspect, shift and way to normalise."""
+    """The outline of the bounding sphere stays in every frame: any lens, aspect, shift and way to normalize."""
     settings = Settings(
         views=6, test_views=0, fov=fov, lens_jitter=jitter, resolution=size, normalize=normalize, layout="random"
     )

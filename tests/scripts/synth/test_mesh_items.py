@@ -1,4 +1,4 @@
-"""Which meshes are found, what they are called, and which files are refused before Blender sees them. No Blender."""
+"""Meshes are found and named, and bad files are refused before Blender opens them. No Blender."""
 
 from __future__ import annotations
 

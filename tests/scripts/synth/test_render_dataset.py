@@ -52,7 +52,7 @@ PRETENDER = """
 
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the pretending workers note each job."""
+    """File in which the fake workers record each job."""
     script, calls = tmp_path / "pretender.py", tmp_path / "calls.txt"
     calls.touch()
     paths = [str(worker_pool.SCRIPT.parent), str(worker_pool.SCRIPT.parent.parent)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 CENTERS = ((3.0, 1.0, -2.0), (1.0, 4.0, 1.0))
-"""Of the two balls, in the coordinates of their file."""
+"""Centers of the two balls, in the coordinates of their file."""
 RADIUS = 0.5
 
 
