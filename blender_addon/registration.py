@@ -8,6 +8,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from . import (
+    operators_cameras,
     operators_guidance,
     operators_inspect,
     operators_run,
@@ -24,6 +25,7 @@ CLASSES = (
     *operators_source.CLASSES,
     *operators_guidance.CLASSES,
     *operators_run.CLASSES,
+    *operators_cameras.CLASSES,
     *operators_inspect.CLASSES,
     *panel.CLASSES,
 )

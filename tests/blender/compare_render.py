@@ -25,7 +25,7 @@ from blender_addon import loading, splat_object  # noqa: E402
 from blender_addon.core import statistics  # noqa: E402
 from blender_addon.core.cameras import read_views  # noqa: E402
 from blender_addon.material import let_cycles_see_through  # noqa: E402
-from blender_addon.operators_inspect import add_camera  # noqa: E402
+from blender_addon.operators_cameras import add_camera  # noqa: E402
 
 
 def pixels(path: Path) -> Any:

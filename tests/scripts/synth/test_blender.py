@@ -16,8 +16,9 @@ import pytest
 from PIL import Image
 from synth import worker_pool
 from synth.cameras import Shot, shots
-from synth.import_mesh import import_mesh, matrix_rows, mend_normals, normalization, vectors
+from synth.import_mesh import import_mesh, matrix_rows, normalization
 from synth.mesh_items import Item, of_shapenet
+from synth.mesh_normals import mend_normals, vectors
 from synth.render_object import RECORD, render_object
 from synth.settings import Settings
 from tiny_meshes import CENTERS, CUBE, RADIUS, TEXTURE_RGB
