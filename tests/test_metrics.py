@@ -19,7 +19,7 @@ LPIPS_TOLERANCE = 5e-5
 
 
 def waves(height: int, width: int, phase: float) -> Tensor:
-    """A smooth colour image [1, H, W, 3] that anybody can make again."""
+    """A smooth color image [1, H, W, 3] that anybody can make again."""
     row = torch.arange(height, dtype=torch.float64)[:, None] / height
     col = torch.arange(width, dtype=torch.float64)[None] / width
     planes = [

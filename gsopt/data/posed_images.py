@@ -43,7 +43,7 @@ class Dataset:
     frames: list[PosedImage]
     """In the order that `--view-ids` counts."""
     held_out: list[PosedImage] | None
-    """Frames the dataset itself holds out; None for a dataset without a split."""
+    """Frames the dataset itself holds out, if it has a split."""
     xyz: Float[Tensor, "P 3"] | None = None
     rgb: UInt8[Tensor, "P 3"] | None = None
     warnings: list[str] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""The first Gaussians: from sparse points, silhouettes or stereo, or at random where the cameras look."""
+"""The first Gaussians: from sparse points, silhouettes or stereo, or at random in view of the cameras."""
 
 from gsopt.init.first_gaussians import first_gaussians
 

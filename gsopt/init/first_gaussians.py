@@ -1,4 +1,4 @@
-"""The first Gaussians of a run: which method, and why."""
+"""The choice of the first Gaussians of a run, and its reason."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ ENOUGH_POINTS = 100
 ENOUGH_AGREED = 0.05
 """Share of the pixels on which two photos must agree: photos of different rooms agree on 0.03 by chance."""
 FEW_PHOTOS = 10
-"""So many find their depth better by stereo, more of them from random points (docs/decisions/0003-stereo.md)."""
-_COLOR_PHOTOS = 16
-Made = tuple[Gaussians, str]
-"""The Gaussians, and how they came about."""
+"""Photos up to which stereo finds depth better than random points do (docs/decisions/0003-stereo.md)."""
+_MAX_COLOR_PHOTOS = 16
+Start = tuple[Gaussians, str]
+"""The Gaussians, and a description of their origin."""
 
 
-def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int) -> Made:
-    """The Gaussians a run starts from, and one line that says which method made them and why.
+def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int) -> Start:
+    """The Gaussians a run starts from, and one line with the method and the reason for it.
 
-    "auto" tries what `_worth_trying` lists. The same scene, config and seed give the same bits. Raises UsageError when
-    the method asked for does not fit the scene.
+    "auto" tries the methods of `_suited_methods` in turn. The same scene, config and seed give the same bits. Raises
+    UsageError when the requested method does not fit the scene.
     """
     check.at_least("--init-count", config.count, 1, "Drop the flag for the default.")
     check.within("sh_degree", sh_degree, 0, 3, "Bands 0 to 3 are supported.")
     generator = torch.Generator().manual_seed(seed)
-    asked = config.method != "auto"
+    requested = config.method != "auto"
     known = 0 if scene.points is None else len(scene.points.xyz)
     reason = (
         f"the scene has {known or 'no'} points and {'every view has' if scene.has_alpha else 'its views have no'} alpha"
     )
-    why = "as asked" if asked else "because {}"
-    for method in _worth_trying(scene, known, config):
-        made = METHODS[method](scene, config.count, sh_degree, generator)
-        if made is not None:
-            return made[0], f"{made[1]}, {why.format(reason)}"
-        if asked:
+    why = "as asked" if requested else "because {}"
+    for method in _suited_methods(scene, known, config):
+        start = METHODS[method](scene, config.count, sh_degree, generator)
+        if start is not None:
+            return start[0], f"{start[1]}, {why.format(reason)}"
+        if requested:
             raise UsageError(MISFITS[method])
-        reason += WITHOUT_SUCCESS[method]
+        reason += FAILURES[method]
     xyz, rgb = _random_points(scene, config.count, generator)
     return gaussians_at(xyz, rgb, sh_degree), f"{len(xyz):,} random points where the cameras look, {why.format(reason)}"
 
 
-def _worth_trying(scene: Scene, known: int, config: InitConfig) -> list[str]:
-    """Methods before random points, best first: of few photos that show all of a scene those places on which they
-    agree, unless the scene has as many points; else its points; the visual hull of what is masked."""
+def _suited_methods(scene: Scene, known: int, config: InitConfig) -> list[str]:
+    """Methods before random points, best first: stereo for few unmasked photos, unless the scene has as many points;
+    else its points; the visual hull of a masked object."""
     if config.method != "auto":
         return [config.method] if config.method in METHODS else []
     few = len(scene.train) <= FEW_PHOTOS
@@ -72,7 +72,7 @@ def _worth_trying(scene: Scene, known: int, config: InitConfig) -> list[str]:
     return [method for method, worth in wanted if worth]
 
 
-def _from_points(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+def _from_points(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Start | None:
     points = scene.points
     if points is None or len(points.xyz) == 0:
         return None
@@ -80,7 +80,7 @@ def _from_points(scene: Scene, count: int, sh_degree: int, generator: torch.Gene
     return gaussians, f"{len(gaussians):,} points that came with the scene"
 
 
-def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Start | None:
     found = hull_points(scene, count, generator) if scene.has_alpha else None
     if found is None:
         return None
@@ -91,7 +91,7 @@ def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Genera
     )
 
 
-def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Made | None:
+def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Start | None:
     found = stereo_points(scene, count, generator)
     if found.share < ENOUGH_AGREED:
         return None
@@ -105,22 +105,23 @@ def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Gene
 def _random_points(
     scene: Scene, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """Places and colours (0..1)."""
+    """Positions and colors (0..1)."""
     cameras = [view.camera for view in scene.train]
     focus = find_focus(cameras, scene.extent)
     xyz = random_points(cameras, focus, count, not scene.has_alpha, generator)
     if scene.has_alpha:
-        # Most points lie beside the object: in its colours they stay there as fog (lego, 8 views: -11 dB).
+        # Most points lie beside the object: in its colors they stay there as fog (lego, 8 views: -11 dB).
         return xyz, torch.full((len(xyz), 3), 0.5)
-    return xyz, mean_colors(small_photos(scene.train, _COLOR_PHOTOS), xyz)
+    return xyz, mean_colors(small_photos(scene.train, _MAX_COLOR_PHOTOS), xyz)
 
 
-METHODS: dict[str, Callable[[Scene, int, int, torch.Generator], Made | None]] = {
+METHODS: dict[str, Callable[[Scene, int, int, torch.Generator], Start | None]] = {
     "points": _from_points,
     "hull": _from_hull,
     "stereo": _from_stereo,
 }
-"""Of a scene, how many, the highest SH band and a generator; None where a method does not fit the scene."""
+"""Functions of the scene, the number of points, the highest SH band and a generator; a method that does not fit the
+scene returns None."""
 MISFITS = {
     "points": "`--init points` needs a scene with points; it has none. Take `auto` instead.",
     "hull": "`--init hull` needs alpha or masks that outline one object in every input view; these do not agree on "
@@ -128,4 +129,4 @@ MISFITS = {
     "stereo": "`--init stereo` needs photos that overlap; too few of these show the same. Add photos between them, "
     "check the poses, or take `--init random`.",
 }
-WITHOUT_SUCCESS = {"hull": ", and its silhouettes enclose nothing", "stereo": ", and its photos agree on nothing"}
+FAILURES = {"hull": ", and its silhouettes enclose nothing", "stereo": ", and its photos agree on nothing"}

@@ -1,4 +1,4 @@
-"""Random points where the cameras look, for scenes that come with neither points nor silhouettes."""
+"""Random points in view of the cameras, for scenes that come with neither points nor silhouettes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BACKGROUND_SHARE = 0.3
 """Share of the points beyond the common region, where the scene has a background (no alpha)."""
 BACKGROUND_FAR = 8.0
 """Depth of the farthest background point, in distances to the focus."""
-_ROUNDS = 32
+_MAX_ROUNDS = 32
 
 
 def random_points(
@@ -23,7 +23,7 @@ def random_points(
     """`count` points: uniform in the ball the cameras frame, where at least half of them see it.
 
     With `background`, BACKGROUND_SHARE of them lie along random pixels behind the focus, uniform in inverse depth.
-    Where the axes do not converge all of them lie along random pixels, from a fifth of the focus distance on.
+    If the axes do not converge, all of them lie along random pixels, from a fifth of the focus distance on.
     """
     if not focus.converging:
         return _along_pixels(cameras, count, 0.2 * focus.distance, BACKGROUND_FAR * focus.distance, generator)
@@ -38,7 +38,7 @@ def _in_common_region(
 ) -> Float[Tensor, "N 3"]:
     """Uniform in the ball around the focus, rejecting what fewer than half of the cameras see."""
     accepted: list[Tensor] = []
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         points = focus.point + focus.radius * _in_unit_ball(count, generator)
         seen = torch.zeros(count, dtype=torch.int32)
         for camera in cameras:

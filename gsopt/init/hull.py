@@ -2,7 +2,7 @@
 
 Carved on voxels, coarse to fine, then sampled: points are placed at random in the voxels and kept where every
 silhouette holds them, so a point's accuracy is that of the masks and not of the voxels (GaussianObject, Yang et al.
-2024, starts from such points). Of the hull of few silhouettes only the round part is filled (`rounded`).
+2024, starts from such points). With few silhouettes only the round part of the hull is filled (`rounded`).
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated, eroded
 from gsopt.init.rounded_hull import rounded
 from gsopt.init.surface_colors import unoccluded_colors
-from gsopt.init.thumbnails import Photo, sample, small_photos
+from gsopt.init.thumbnails import Thumbnail, sample, small_photos
 
 SURFACE_SHARE = 0.7
 """Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and
 what is carved away during training must find Gaussians behind it to take over. On few views 0.4 to 0.7 do equally well
 and 1 (none inside) clearly worse."""
 MAX_PHOTOS = 100
-"""Silhouettes used at most; more hardly carve."""
-FEW = 16
+"""Most silhouettes used; more hardly carve."""
+UNROUNDED_FROM = 16
 """Silhouettes from which on the hull itself is taken: it has hardly a corner left."""
-COARSE = 48
+COARSE_SIDE = 48
 """Voxels along each side of the first grid."""
-_LOOKUPS = 6e7
+_MAX_LOOKUPS = 6e7
 """Voxels times views of the second grid: bounds its time."""
-_SIDE_LOW, _SIDE_HIGH = 48, 112
-_SOLID = 0.5
+_MIN_SIDE, _MAX_SIDE = 48, 112
+"""Voxels along each side of the second grid."""
+_SOLID_ALPHA = 0.5
 """Alpha above which a pixel belongs to the object."""
-_FULL = 0.98
+_FULL_COVERAGE = 0.98
 """Silhouettes that cover more than this of all pixels outline nothing."""
-_ROUNDS = 24
+_MAX_ROUNDS = 24
 
 
 @dataclass(frozen=True)
 class HullPoints:
-    """Coloured points in the hull."""
+    """Colored points in the hull."""
 
     xyz: Float[Tensor, "N 3"]
     rgb: Float[Tensor, "N 3"]
@@ -55,15 +56,15 @@ class HullPoints:
 
 
 def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoints | None:
-    """`count` coloured points on and in the hull of the input views; None when the silhouettes enclose nothing."""
+    """`count` colored points on and in the hull of the input views, or None for silhouettes that enclose nothing."""
     photos = small_photos(scene.drawn, MAX_PHOTOS)
     covered = sum(float((photo.planes[3] > 127).double().mean()) for photo in photos) / len(photos)
-    if covered > _FULL:
+    if covered > _FULL_COVERAGE:
         return None
     grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
     if grid is None:
         return None
-    if len(photos) < FEW:
+    if len(photos) < UNROUNDED_FROM:
         cells = rounded(grid.occupied, grid.centers(grid.occupied), grid.voxel, photos)
         grid = replace(grid, occupied=cells)
     xyz = _sample_points(grid, photos, count, generator)
@@ -73,16 +74,16 @@ def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoi
     return HullPoints(xyz, unoccluded_colors(grid, colored, xyz), len(photos), grid.voxel)
 
 
-def carve(photos: list[Photo], focus: Focus) -> Grid | None:
-    """Find the object's box on a coarse grid, then carve a fine one inside it; None when nothing is left."""
+def carve(photos: list[Thumbnail], focus: Focus) -> Grid | None:
+    """Finds the object's box on a coarse grid, then carves a fine one inside it; returns None for an empty hull."""
     half = 2 * focus.radius
-    coarse = _carved(photos, focus.point - half, torch.full((3,), 2 * half), COARSE, cautious=True)
+    coarse = _carved(photos, focus.point - half, torch.full((3,), 2 * half), COARSE_SIDE, cautious=True)
     if not bool(coarse.occupied.any()):
         return None
     cells = torch.nonzero(coarse.occupied)
     low = coarse.low + (cells.amin(0) - 1) * coarse.voxel
     size = (cells.amax(0) - cells.amin(0) + 3) * coarse.voxel
-    side = int(min(max((_LOOKUPS / len(photos)) ** (1 / 3), _SIDE_LOW), _SIDE_HIGH))
+    side = int(min(max((_MAX_LOOKUPS / len(photos)) ** (1 / 3), _MIN_SIDE), _MAX_SIDE))
     fine = _carved(photos, low, size, side, cautious=False)
     if not bool(fine.occupied.any()):  # thinner than a voxel everywhere
         fine = _carved(photos, low, size, side, cautious=True)
@@ -90,9 +91,9 @@ def carve(photos: list[Photo], focus: Focus) -> Grid | None:
 
 
 def _carved(
-    photos: list[Photo], low: Float[Tensor, "3"], size: Float[Tensor, "3"], side: int, *, cautious: bool
+    photos: list[Thumbnail], low: Float[Tensor, "3"], size: Float[Tensor, "3"], side: int, *, cautious: bool
 ) -> Grid:
-    """About side³ cubic voxels that fill a box, kept where their centres (or, cautiously, any part) are in the hull."""
+    """About side³ cubic voxels that fill a box, kept where their centers (or, cautiously, any part) are in the hull."""
     voxel = float(size.prod()) ** (1 / 3) / side
     shape = [max(1, math.ceil(float(extent) / voxel)) for extent in size]
     grid = Grid(torch.ones(shape, dtype=torch.bool), low, voxel)
@@ -100,7 +101,7 @@ def _carved(
     return Grid(kept.view(shape), low, voxel)
 
 
-def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0.0) -> Bool[Tensor, "N"]:
+def in_hull(photos: list[Thumbnail], points: Float[Tensor, "N 3"], radius: float = 0.0) -> Bool[Tensor, "N"]:
     """True where every photo that shows a point shows it solid, and at least half of the photos show it. A photo with
     all of the object in it must show the point: without that, few views leave a second hull beside the first, in what
     only two of them see (4 views of a stone lantern: 21.6 dB instead of 23.7).
@@ -117,7 +118,7 @@ def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0
         if photo.shows_all():
             passed &= _near(photo.camera, column, row, depth, radius)
         column, row = (torch.where(visible, coordinate, 0.0) for coordinate in (column, row))  # no NaN to sample at
-        rows = torch.nonzero((visible & (sample(alpha, column, row)[0] > _SOLID)) | passed)[:, 0]
+        rows = torch.nonzero((visible & (sample(alpha, column, row)[0] > _SOLID_ALPHA)) | passed)[:, 0]
         alive, here = alive.index_select(0, rows), here.index_select(0, rows)
         shown = shown.index_select(0, rows) + visible.index_select(0, rows)
     kept = torch.zeros(len(points), dtype=torch.bool)
@@ -126,7 +127,7 @@ def in_hull(photos: list[Photo], points: Float[Tensor, "N 3"], radius: float = 0
 
 
 def _near(camera: Cameras, column: Tensor, row: Tensor, depth: Tensor, radius: float) -> Bool[Tensor, "N"]:
-    """Whether a ball of this radius around a point may reach into the image; never for a radius of 0."""
+    """True when a ball of this radius around a point may reach into the image; never for a radius of 0."""
     if radius == 0:
         return torch.zeros(len(column), dtype=torch.bool)
     reach = radius * float(camera.Ks[0].diagonal()[:2].max()) / (depth - radius).clamp_min(1e-12)
@@ -134,7 +135,7 @@ def _near(camera: Cameras, column: Tensor, row: Tensor, depth: Tensor, radius: f
     return (depth <= radius) | (across & (row > -reach) & (row < camera.height + reach))
 
 
-def _widened(photo: Photo, radius: float, depths: Float[Tensor, "M"]) -> Float[Tensor, "1 H W"]:
+def _widened(photo: Thumbnail, radius: float, depths: Float[Tensor, "M"]) -> Float[Tensor, "1 H W"]:
     """Alpha spread by what `radius` covers at the median depth, px."""
     alpha = photo.alpha()
     if len(depths) == 0:
@@ -155,7 +156,7 @@ def _spread(planes: Float[Tensor, "1 H W"], reach: int) -> Float[Tensor, "1 H W"
     return planes
 
 
-def _sample_points(grid: Grid, photos: list[Photo], count: int, generator: torch.Generator) -> Float[Tensor, "N 3"]:
+def _sample_points(grid: Grid, photos: list[Thumbnail], count: int, generator: torch.Generator) -> Float[Tensor, "N 3"]:
     """Points near the surface and points inside, each accepted by `in_hull`."""
     core = eroded(grid.occupied)
     rim = dilated(grid.occupied) & ~core
@@ -166,12 +167,12 @@ def _sample_points(grid: Grid, photos: list[Photo], count: int, generator: torch
 
 
 def _accepted(
-    grid: Grid, cells: Bool[Tensor, "X Y Z"], photos: list[Photo], count: int, generator: torch.Generator
+    grid: Grid, cells: Bool[Tensor, "X Y Z"], photos: list[Thumbnail], count: int, generator: torch.Generator
 ) -> Float[Tensor, "N 3"]:
     """`count` uniform random points in `cells` and in the hull; fewer when few places are."""
     corners = grid.centers(cells) - 0.5 * grid.voxel
     accepted = [torch.empty(0, 3)]
-    for _ in range(_ROUNDS if len(corners) else 0):
+    for _ in range(_MAX_ROUNDS if len(corners) else 0):
         missing = count - sum(map(len, accepted))
         if missing <= 0:
             break

@@ -1,7 +1,7 @@
-"""Exact distances to the nearest neighbours, for any density, many points at a time.
+"""Exact distances to the nearest neighbors, for any density, many points at a time.
 
 A balanced k-d tree (Friedman, Bentley and Finkel 1977) is descended breadth first by many points at once: a list of
-(point, cell) pairs, from which a pair goes when the cell's box lies farther than the point's k-th neighbour can.
+(point, cell) pairs, from which a pair goes when the cell's box lies farther than the point's k-th neighbor can.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-LEAF = 16
-"""Points a leaf holds at most."""
+LEAF_POINTS = 16
+"""Most points of a leaf."""
 _LEAVES_AT_ONCE = 1 << 11
 """Bounds the memory of the list of pairs."""
-_MANY = 64
+_MAX_MERGED_LEAVES = 64
 """Leaves per point up to which points are merged side by side."""
-_RELATIVE_FLOOR = 1e-3
+_DISTANCE_FLOOR = 1e-3
 """Smallest distance returned, as a share of the median: points all but on top of each other must not vanish."""
 
 
 def mean_neighbor_distance(points: Float[Tensor, "N 3"], k: int = 3) -> Float[Tensor, "N"]:
     """Mean distance of each point to the `k` nearest other places where points are (fewer where there are fewer).
 
-    Points on top of each other count as one place and share its distance, so the result is positive. Where there is
-    one place only it is 1.
+    Points on top of each other count as one place and share its distance, so the result is positive. It is 1 for a
+    single place.
     """
     if len(points) == 0:
         return torch.ones(0)
@@ -36,7 +36,7 @@ def mean_neighbor_distance(points: Float[Tensor, "N 3"], k: int = 3) -> Float[Te
     if len(places) < 2:
         return torch.ones(len(points))
     distances = nearest_distances(places, min(k, len(places) - 1)).mean(dim=1)
-    return distances.clamp(min=max(_RELATIVE_FLOOR * float(distances.median()), 1e-20))[place]
+    return distances.clamp(min=max(_DISTANCE_FLOOR * float(distances.median()), 1e-20))[place]
 
 
 def nearest_distances(points: Float[Tensor, "N 3"], k: int) -> Float[Tensor, "N k"]:
@@ -63,7 +63,7 @@ class _Tree:
 
 def _build(points: Float[Tensor, "N 3"]) -> _Tree:
     """Halve every cell along its widest axis until it fits a leaf."""
-    depth = max(0, math.ceil(math.log2(len(points) / LEAF)))
+    depth = max(0, math.ceil(math.log2(len(points) / LEAF_POINTS)))
     order = torch.full((1, math.ceil(len(points) / 2**depth) * 2**depth), -1)
     order[0, : len(points)] = torch.arange(len(points))
     boxes = []
@@ -92,12 +92,12 @@ def _search(tree: _Tree, queries: Float[Tensor, "R 3"], rows: Tensor, own_leaf: 
     counts = torch.bincount(query, minlength=len(queries))
     first = counts.cumsum(0) - counts
     # Few points see many leaves: lone ones beside a tight cluster, all at one distance in float32. One by one, then.
-    for lone in torch.nonzero(counts > _MANY)[:, 0].tolist():
+    for lone in torch.nonzero(counts > _MAX_MERGED_LEAVES)[:, 0].tolist():
         leaves = leaf[first[lone] : first[lone] + counts[lone]]
         alone = _squared_distances(tree, queries[lone].expand(len(leaves), 3), leaves, rows[lone]).flatten()
         best[:, lone] = torch.cat([best[:, lone], alone]).topk(k, largest=False).values
     rank = torch.arange(len(query)) - first[query]  # which of its query's leaves this one is
-    usual = torch.nonzero(counts[query] <= _MANY)[:, 0]
+    usual = torch.nonzero(counts[query] <= _MAX_MERGED_LEAVES)[:, 0]
     by_rank = usual[rank[usual].argsort(stable=True)]
     for pairs in by_rank.split(torch.bincount(rank[usual]).tolist()):
         here = query[pairs]
@@ -144,7 +144,7 @@ def _merge(
 
 
 def _squared_distances(tree: _Tree, queries: Tensor, leaf: Tensor, rows: Tensor) -> Float[Tensor, "M P"]:
-    """To the points of one leaf per query; infinite to the query itself (`rows` says which point it is)."""
+    """To the points of one leaf per query; infinite to the query itself (`rows`: the index of each query)."""
     x, y, z = (
         tree.coordinates.index_select(0, leaf).T.reshape(3, tree.leaves.shape[1], len(leaf)) - queries.T[:, None]
     ).unbind(0)

@@ -1,4 +1,4 @@
-"""Gaussians at given points: round, faint, as large as the gap to their neighbours (Kerbl et al. 2023, section 5.1)."""
+"""Gaussians at given points: round, faint, as large as the gap to their neighbors (Kerbl et al. 2023, section 5.1)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.init.neighbors import mean_neighbor_distance
 
-OPACITY = 0.1
+FIRST_OPACITY = 0.1
 NEIGHBORS = 3
 
 
 def gaussians_at(xyz: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], sh_degree: int) -> Gaussians:
-    """Isotropic Gaussians at `xyz` (float32) of colour `rgb` (0..1).
+    """Isotropic Gaussians at `xyz` (float32) of color `rgb` (0..1).
 
     Standard deviation: the mean distance to the three nearest others; opacity 0.1; no rotation; bands above 0 are 0.
     """
@@ -29,7 +29,7 @@ def gaussians_at(xyz: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], sh_degree
         means=xyz.clone(),
         quats=quats,
         log_scales=log_distance[:, None].repeat(1, 3),
-        logit_opacities=torch.full((count,), math.log(OPACITY / (1 - OPACITY))),
+        logit_opacities=torch.full((count,), math.log(FIRST_OPACITY / (1 - FIRST_OPACITY))),
         sh0=sh0_from_rgb(rgb)[:, None],
         shN=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
     )

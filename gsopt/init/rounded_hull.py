@@ -1,4 +1,4 @@
-"""A visual hull without the corners that no silhouette asks for.
+"""A visual hull without the corners that no silhouette needs.
 
 The hull is the largest of all shapes with the given silhouettes (Franco, Lapierre & Boyer 2006); beside the object,
 where the cones of two views cross, it keeps wedges of matter that is not there. Few things have such edges. So every
@@ -8,8 +8,8 @@ hull that holds voxel x (local thickness, Hildebrand & Rüegsegger 1997),
     (1)  keep x where  T(x) >= min over views v of  max T(y) over the voxels y in the pixel of x in v.
 
 An edge is thin and lies before or behind something thick in all views; a leg or a handle that stands out in one view is
-the thickest in its pixels there and stays. Every silhouette remains filled. What hides before thicker parts in all
-views is lost, and of an egg the middle of its sides: training puts it back. It adds matter far more readily than it
+the thickest in its pixels there and stays. Every silhouette remains filled. Matter that hides before thicker parts in
+all views is lost, as is the middle of an egg's sides: training puts it back. It adds matter far more readily than it
 takes matter away (docs/decisions/0001-schedule.md has the figures).
 """
 
@@ -22,18 +22,18 @@ from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
 from gsopt.geometry.projection import inside, project
-from gsopt.init.thumbnails import Photo
+from gsopt.init.thumbnails import Thumbnail
 
 ROUNDS = 2
-"""What remains is measured again: without the tips their stumps are thin."""
-RATIO = 1.1
-"""Between two radii that are told apart."""
-FAR = 1 << 13
+"""The remains are measured again: without the tips their stumps are thin."""
+RADIUS_RATIO = 1.1
+"""Ratio of two successive radii."""
+FAR_SQUARED = 1 << 13
 """Squared distance beyond everything, cells; twice that still fits 16 bits."""
 
 
 def rounded(
-    cells: Bool[Tensor, "X Y Z"], centers: Float[Tensor, "M 3"], voxel: float, photos: list[Photo]
+    cells: Bool[Tensor, "X Y Z"], centers: Float[Tensor, "M 3"], voxel: float, photos: list[Thumbnail]
 ) -> Bool[Tensor, "X Y Z"]:
     """The voxels that (1) keeps; `centers` are those of the true ones, in scene units as their edge `voxel`."""
     for _ in range(ROUNDS):
@@ -47,7 +47,9 @@ def rounded(
     return cells
 
 
-def thickest(photo: Photo, points: Float[Tensor, "M 3"], voxel: float, thick: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
+def thickest(
+    photo: Thumbnail, points: Float[Tensor, "M 3"], voxel: float, thick: Float[Tensor, "M"]
+) -> Float[Tensor, "M"]:
     """For every point the largest thickness in its pixel (as wide as a voxel at the middle depth); infinite where the
     photo does not show it."""
     column, row, depth = project(photo.camera, points)
@@ -66,27 +68,27 @@ def thickest(photo: Photo, points: Float[Tensor, "M 3"], voxel: float, thick: Fl
 
 
 def thickness(cells: Bool[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"]:
-    """Per true cell the radius of the largest ball of true cells that holds it, in cells, in steps of RATIO down from
-    the largest of all; 0 elsewhere."""
+    """Per true cell the radius of the largest ball of true cells that holds it, in cells, in steps of RADIUS_RATIO down
+    from the largest of all; 0 elsewhere."""
     solid = torch.nn.functional.pad(cells, (1,) * 6)
     depth = squared_distance(~solid, max(solid.shape))
     largest = math.sqrt(int(depth.max()))
     thick = torch.zeros(solid.shape)
-    for level in reversed(range(1 + int(math.log(max(1.0, largest), RATIO)))):
-        radius = largest / RATIO**level
+    for level in reversed(range(1 + int(math.log(max(1.0, largest), RADIUS_RATIO)))):
+        radius = largest / RADIUS_RATIO**level
         thick[squared_distance(depth >= radius**2, math.ceil(radius)) <= radius**2] = radius
     return (thick * solid)[1:-1, 1:-1, 1:-1]
 
 
 def squared_distance(cells: Bool[Tensor, "X Y Z"], reach: int) -> Int16[Tensor, "X Y Z"]:
-    """To the nearest true cell, exact within `reach` cells along each axis, FAR beyond: one axis after the other
-    (Felzenszwalb & Huttenlocher 2012)."""
-    found = torch.where(cells, 0, FAR).to(torch.int16)
+    """Squared distance to the nearest true cell, exact within `reach` cells along each axis, FAR_SQUARED beyond: one
+    axis after the other (Felzenszwalb & Huttenlocher 2012)."""
+    found = torch.where(cells, 0, FAR_SQUARED).to(torch.int16)
     for axis in range(3):
         size, nearest = found.shape[axis], found.clone()
-        for offset in range(1, min(reach, size - 1, math.isqrt(FAR)) + 1):
+        for offset in range(1, min(reach, size - 1, math.isqrt(FAR_SQUARED)) + 1):
             for behind, ahead in ((0, offset), (offset, 0)):
                 there = nearest.narrow(axis, ahead, size - offset)
                 torch.minimum(there, found.narrow(axis, behind, size - offset) + offset**2, out=there)
-        found = nearest.clamp_(max=FAR)
+        found = nearest.clamp_(max=FAR_SQUARED)
     return found

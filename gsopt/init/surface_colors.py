@@ -1,4 +1,4 @@
-"""What colour the photos show of a shape made of voxels, and where."""
+"""Colors that photos show on the surface of a shape made of voxels."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from torch import Tensor
 
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
-from gsopt.init.thumbnails import Photo, colors_from_sums, sample
+from gsopt.init.thumbnails import Thumbnail, colors_from_sums, sample
 
 _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
 class Front:
-    """What of a shape lies foremost in one photo."""
+    """The front surface of a shape in one photo."""
 
-    photo: Photo
+    photo: Thumbnail
     depths: Float[Tensor, "h w"]
     """Smallest depth of the shape per block of pixels, infinite where there is none."""
     step: int
     """Edge of a block, px: about a voxel."""
 
     def buried(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """How far each point lies behind the front, scene units; infinite outside the photo."""
+        """Distance of each point behind the front, scene units; infinite outside the photo."""
         column, row, depth = project(self.photo.camera, points)
         shown = torch.nonzero(inside(self.photo.camera, column, row, depth))[:, 0]
         height, width = self.depths.shape
@@ -39,8 +39,8 @@ class Front:
         return found
 
 
-def front_of(grid: Grid, photo: Photo, surface: Float[Tensor, "M 3"]) -> Front:
-    """From the centres of the shape's surface voxels."""
+def front_of(grid: Grid, photo: Thumbnail, surface: Float[Tensor, "M 3"]) -> Front:
+    """The front of a shape, from the centers of its surface voxels."""
     column, row, depth = project(photo.camera, surface)
     shown = inside(photo.camera, column, row, depth)
     column, row, depth = column[shown], row[shown], depth[shown]
@@ -52,22 +52,22 @@ def front_of(grid: Grid, photo: Photo, surface: Float[Tensor, "M 3"]) -> Front:
     return Front(photo, depths.view(height, width), step)
 
 
-def unoccluded_colors(grid: Grid, photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Mean colour over the photos in which a point lies nearest behind the shape's front surface.
+def unoccluded_colors(grid: Grid, photos: Sequence[Thumbnail], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Mean color over the photos in which a point lies nearest behind the shape's front surface.
 
     For a point on the surface these are the photos that see it; for one inside, those that see the surface before it.
     """
     surface = grid.surface()
     fronts = [front_of(grid, photo, surface) for photo in photos]
-    # A voxel and a half: the front depths are those of voxel centres.
+    # A voxel and a half: the front depths are those of voxel centers.
     chunks = [_sums(fronts, chunk, 1.5 * grid.voxel, nearest=True) for chunk in points.split(_CHUNK)]
     return torch.cat([colors_from_sums(total) for total in chunks])
 
 
 def seen_colors(
-    grid: Grid, photos: Sequence[Photo], points: Float[Tensor, "N 3"]
+    grid: Grid, photos: Sequence[Thumbnail], points: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
-    """Mean colour over the photos that see a point of the surface, and whether any does."""
+    """Mean color over the photos that see a point of the surface, and True when any does."""
     surface = grid.surface()
     fronts = [front_of(grid, photo, surface) for photo in photos]
     total = _sums(fronts, points, 1.5 * grid.voxel, nearest=False)
@@ -77,7 +77,7 @@ def seen_colors(
 def _sums(
     fronts: Sequence[Front], points: Float[Tensor, "N 3"], tolerance: float, *, nearest: bool
 ) -> Float[Tensor, "4 N"]:
-    """Premultiplied colour and alpha, added up over the photos in which a point lies no more than `tolerance` behind
+    """Premultiplied color and alpha, added up over the photos in which a point lies no more than `tolerance` behind
     the front, or behind the one it is `nearest` to."""
     buried = torch.stack([front.buried(points) for front in fronts])
     chosen = buried <= (buried.amin(dim=0) if nearest else 0.0) + tolerance

@@ -1,4 +1,4 @@
-"""Small copies of the input views, and what they show at projected points."""
+"""Small copies of the input views, and their colors at projected points."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.projection import inside, project
 
 MAX_SIDE = 512
-"""Longer side of the copies, px: enough to place and colour the first Gaussians, and a bound on memory."""
+"""Longer side of the copies, px: enough to place and color the first Gaussians, and a bound on memory."""
 
 
 @dataclass(frozen=True)
-class Photo:
+class Thumbnail:
     """A view, at most MAX_SIDE large."""
 
     camera: Cameras
     planes: UInt8[Tensor, "4 H W"]
-    """Colour times alpha, then alpha."""
+    """Color times alpha, then alpha."""
     colored: bool = True
-    """Whether its colours are to be believed, and not only its silhouette."""
+    """False when only its silhouette is reliable."""
 
     def alpha(self) -> Float[Tensor, "1 H W"]:
         """0..1."""
         return self.planes[3:].float() / 255
 
     def shows_all(self) -> bool:
-        """Whether there is a silhouette and it keeps off the border: what lies outside the picture is then no part of
-        the object."""
+        """True when there is a silhouette and it keeps off the border: nothing outside the image then belongs to the
+        object."""
         solid = self.planes[3] > 127
         touches = any(bool(edge.any()) for edge in (solid[0], solid[-1], solid[:, 0], solid[:, -1]))
         return bool(solid.any()) and not touches
 
 
-def small_photos(views: Sequence[View], most: int) -> list[Photo]:
+def small_photos(views: Sequence[View], most: int) -> list[Thumbnail]:
     """Copies of up to `most` views, those farthest apart when there are more, in the order of `views`."""
     rows = list(range(len(views)))
     if len(rows) > most:
@@ -49,18 +49,18 @@ def small_photos(views: Sequence[View], most: int) -> list[Photo]:
     return [_small(views[row]) for row in rows]
 
 
-def _small(view: View) -> Photo:
+def _small(view: View) -> Thumbnail:
     planes = premultiply(view.pixels())
     factor = max(1.0, max(planes.shape[1:]) / MAX_SIDE)
     width, height = (downscaled_size(size, factor) for size in (planes.shape[2], planes.shape[1]))
     planes = (area_downscale(planes, width, height) + 0.5).clamp(0, 255).to(torch.uint8)
     if len(planes) == 3:
         planes = torch.cat([planes, torch.full_like(planes[:1], 255)])
-    return Photo(view.camera.resized(width, height), planes, colored=view.color > 0)
+    return Thumbnail(view.camera.resized(width, height), planes, colored=view.color > 0)
 
 
 def sample(planes: Float[Tensor, "C H W"], column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "C N"]:
-    """Bilinear values at pixel coordinates (centres at +0.5); beyond the border the border's."""
+    """Bilinear values at pixel coordinates (centers at +0.5); beyond the border the border's."""
     height, width = planes.shape[1:]
     grid = torch.stack([column * (2 / width) - 1, row * (2 / height) - 1], dim=-1)
     values = torch.nn.functional.grid_sample(
@@ -69,8 +69,8 @@ def sample(planes: Float[Tensor, "C H W"], column: Float[Tensor, "N"], row: Floa
     return values[0, :, 0]
 
 
-def mean_colors(photos: list[Photo], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Mean colour (0..1, alpha-weighted) over the photos that show a point; mid grey where none does."""
+def mean_colors(photos: list[Thumbnail], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Mean color (0..1, alpha-weighted) over the photos that show a point; mid gray where none does."""
     total = torch.zeros(4, len(points))
     for photo in photos:
         column, row, depth = project(photo.camera, points)
@@ -80,6 +80,6 @@ def mean_colors(photos: list[Photo], points: Float[Tensor, "N 3"]) -> Float[Tens
 
 
 def colors_from_sums(total: Float[Tensor, "4 N"]) -> Float[Tensor, "N 3"]:
-    """Sums of premultiplied colour and alpha to straight colour; mid grey where the alpha is 0."""
+    """Sums of premultiplied color and alpha to straight color; mid gray where the alpha is 0."""
     weight = total[3:]
     return torch.where(weight > 1e-6, total[:3] / weight.clamp(min=1e-6), 0.5).T.clamp(0, 1)

@@ -16,7 +16,7 @@ class Mirror:
     """The plane normal · x = offset."""
 
     normal: Float[Tensor, "3"]
-    """Of length 1."""
+    """Unit vector."""
     offset: float
     """Scene units."""
 
@@ -26,12 +26,12 @@ class Mirror:
         return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z - self.offset
 
     def reflect(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
-        """Where the points appear behind the mirror."""
+        """Mirror images of the points."""
         return points - 2 * self.distance(points)[..., None] * self.normal
 
     def camera(self, camera: Cameras) -> Cameras:
-        """Where one camera stands behind the mirror. What it sees of a symmetric object is its photo, read from right
-        to left: with M the reflection and F = diag(-1, 1, 1), cam_from_world is F V M, again a rigid motion."""
+        """The camera's mirror image. Its view of a symmetric object is the camera's photo, read from right to
+        left: with M the reflection and F = diag(-1, 1, 1), cam_from_world is F V M, again a rigid motion."""
         n = self.normal.double()
         reflection = torch.eye(4, dtype=torch.float64)
         reflection[:3, :3] -= 2 * n[:, None] * n

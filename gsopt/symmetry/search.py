@@ -1,4 +1,4 @@
-"""Where a mirror plane may be: all directions are tried on coarse voxels, the best are refined on the outlines."""
+"""Search for mirror planes: all directions on coarse voxels, then refinement of the best on the outlines."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from torch import Tensor
 
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated
-from gsopt.init.thumbnails import Photo
+from gsopt.init.thumbnails import Thumbnail
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import Silhouettes
 
 DIRECTIONS = 400
 """Normals tried, spread over the half sphere: about 7 degrees apart."""
-OFFSETS, FARTHEST = 13, 0.2
-"""Planes tried per normal, and how far from the hull's centre, in hull radii."""
-COARSER = 3
-"""Voxels are joined by this many along each axis."""
-UNCOVERED = 0.05
+OFFSETS, MAX_OFFSET = 13, 0.2
+"""Planes tried per normal, and their largest distance from the hull's center, in hull radii."""
+COARSENING = 3
+"""Voxels joined along each axis."""
+MAX_UNCOVERED = 0.05
 """A candidate may leave this share of the silhouettes unexplained: its direction is 3 degrees off."""
-APART = 20.0
-"""Between the normals of two candidates, degrees."""
-MOST = 6
+CANDIDATE_ANGLE = 20.0
+"""Least angle between the normals of two candidates, degrees."""
+MAX_CANDIDATES = 6
 """Candidates refined."""
-ITERATIONS, TRIES = 15, 4
-"""Steps of the refinement at most, and dampings tried for each."""
-GAIN, FINE = 0.995, 3e-4
-"""It ends where a step leaves more than this share of the misses, or moves by less: radians, radii."""
-HOPE, HOPELESS = 4, 3.0
-"""It is given up where so many steps still leave so many times what is wanted."""
+MAX_STEPS, MAX_DAMPINGS = 15, 4
+"""Steps of the refinement, and dampings tried for each."""
+LEAST_GAIN, LEAST_STEP = 0.995, 3e-4
+"""It ends when a step leaves more than this share of the misses, or moves by less: radians, radii."""
+GIVE_UP_AT, GIVE_UP_ABOVE = 4, 3.0
+"""It is abandoned when this many steps leave more than so many times the accepted misses."""
 _CHUNK = 32
 
 
 @dataclass(frozen=True)
 class Ball:
-    """Around the hull."""
+    """A ball around the hull."""
 
     center: Float[Tensor, "3"]
     radius: float
@@ -50,27 +50,27 @@ def bounding_ball(grid: Grid) -> Ball:
     return Ball(center, float((cells - center).norm(dim=1).max()) + grid.voxel)
 
 
-def candidates(grid: Grid, photos: list[Photo], ball: Ball) -> list[Mirror]:
-    """Up to MOST planes, best first: those that leave least of the silhouettes unexplained when the hull is cut with
-    its mirror image."""
+def candidates(grid: Grid, photos: list[Thumbnail], ball: Ball) -> list[Mirror]:
+    """Up to MAX_CANDIDATES planes, best first: those that leave least of the silhouettes unexplained when the hull is
+    cut with its mirror image."""
     normals = half_sphere(DIRECTIONS)
-    shifts = torch.linspace(-FARTHEST, FARTHEST, OFFSETS) * ball.radius
+    shifts = torch.linspace(-MAX_OFFSET, MAX_OFFSET, OFFSETS) * ball.radius
     middle = (normals * ball.center).sum(1)
     offsets = (middle[:, None] + shifts).flatten()
     normals = normals.repeat_interleave(OFFSETS, 0)
-    lost = uncovered(joined(grid, COARSER), photos, normals, offsets)
+    lost = uncovered(joined(grid, COARSENING), photos, normals, offsets)
     found: list[Mirror] = []
     for row in lost.argsort(stable=True).tolist():
-        if len(found) == MOST or float(lost[row]) > UNCOVERED:
+        if len(found) == MAX_CANDIDATES or float(lost[row]) > MAX_UNCOVERED:
             break
         mirror = Mirror(normals[row], float(offsets[row]))
-        if not any(same(mirror, other, APART) for other in found):
+        if not any(same(mirror, other, CANDIDATE_ANGLE) for other in found):
             found.append(mirror)
     return found
 
 
 def same(a: Mirror, b: Mirror, degrees: float) -> bool:
-    """Whether the normals of two planes are nearer to each other than this."""
+    """True when the normals of two planes are nearer to each other than `degrees`."""
     return abs(float((a.normal * b.normal).sum())) > math.cos(math.radians(degrees))
 
 
@@ -89,7 +89,7 @@ def joined(grid: Grid, factor: int) -> Grid:
 
 
 def uncovered(
-    grid: Grid, photos: list[Photo], normals: Float[Tensor, "P 3"], offsets: Float[Tensor, "P"]
+    grid: Grid, photos: list[Thumbnail], normals: Float[Tensor, "P 3"], offsets: Float[Tensor, "P"]
 ) -> Float[Tensor, "P"]:
     """For every plane the share of the silhouettes (in pixels a voxel wide, mean over the photos) that no voxel covers
     whose mirror image also lies in the hull, give or take one voxel."""
@@ -107,7 +107,7 @@ def uncovered(
 def _also_behind(
     wide: Bool[Tensor, "X Y Z"], grid: Grid, centers: Float[Tensor, "M 3"], normals: Tensor, offsets: Tensor
 ) -> Bool[Tensor, "M P"]:
-    """Whether the mirror image of a voxel's centre lies in `wide`, which is padded by one voxel."""
+    """True when the mirror image of a voxel's center lies in `wide`, which is padded by one voxel."""
     beyond = sum(centers[:, axis, None] * normals[:, axis] for axis in range(3)) - offsets
     inside_grid = torch.ones_like(beyond, dtype=torch.bool)
     index = torch.zeros_like(beyond, dtype=torch.int64)
@@ -119,8 +119,10 @@ def _also_behind(
     return wide.flatten()[index] & inside_grid
 
 
-def _pixels(photo: Photo, centers: Float[Tensor, "M 3"], voxel: float) -> tuple[Int64[Tensor, "K"], Int64[Tensor, "K"]]:
-    """Which centres the photo shows, and the pixel of each, counted from 0 without gaps."""
+def _pixels(
+    photo: Thumbnail, centers: Float[Tensor, "M 3"], voxel: float
+) -> tuple[Int64[Tensor, "K"], Int64[Tensor, "K"]]:
+    """Rows of the centers that the photo shows, and the pixel of each, counted from 0 without gaps."""
     column, row, depth = project(photo.camera, centers)
     shown = torch.nonzero(inside(photo.camera, column, row, depth))[:, 0]
     if len(shown) == 0:
@@ -141,23 +143,23 @@ def _uncovered_share(rows: Tensor, pixel: Tensor, stays: Bool[Tensor, "M P"]) ->
 
 def refined(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[Mirror, float]:
     """The plane moved to where the outlines miss least (Levenberg-Marquardt over two tilts and the offset), and the
-    root mean square of what is left, px. One that stays far from `wanted` is given up."""
+    root mean square of what is left, px. A plane that stays far from `wanted` is given up."""
     misses, damping = silhouettes.misses(mirror), 1e-2
-    for iteration in range(ITERATIONS):
-        if iteration == HOPE and _rms(misses) > HOPELESS * wanted:
+    for iteration in range(MAX_STEPS):
+        if iteration == GIVE_UP_AT and _rms(misses) > GIVE_UP_ABOVE * wanted:
             break
         J = _jacobian(mirror, silhouettes, ball)
         A, b = J.T @ J, J.T @ misses
         step = None
-        for _ in range(TRIES):
+        for _ in range(MAX_DAMPINGS):
             tried = -torch.linalg.solve(A + damping * torch.diag(A.diagonal() + 1e-6), b)
             moved = _moved(mirror, tried, ball)
             left = silhouettes.misses(moved)
-            if _rms(left) < GAIN * _rms(misses):
+            if _rms(left) < LEAST_GAIN * _rms(misses):
                 step, mirror, misses, damping = tried, moved, left, max(damping / 4, 1e-6)
                 break
             damping *= 4
-        if step is None or float(step.abs().max()) < FINE:
+        if step is None or float(step.abs().max()) < LEAST_STEP:
             break
     return mirror, _rms(misses)
 
@@ -176,7 +178,7 @@ def _jacobian(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, step: float 
 
 
 def _moved(mirror: Mirror, change: Float[Tensor, "3"], ball: Ball) -> Mirror:
-    """The plane turned about the ball's centre by two small angles (radians) and shifted by a share of its radius."""
+    """The plane turned about the ball's center by two small angles (radians) and shifted by a share of its radius."""
     n = mirror.normal
     axis = torch.eye(3)[int(n.abs().numpy().argmin())]
     u = torch.nn.functional.normalize(torch.linalg.cross(n, axis), dim=0)

@@ -1,4 +1,4 @@
-"""How well silhouettes agree with a mirror plane, to fractions of a pixel.
+"""Agreement of silhouettes with a mirror plane, to fractions of a pixel.
 
 Silhouettes of one object cohere: on the ray of every outline pixel lies a point that no other silhouette excludes
 (Hernández, Schmitt & Cipolla 2007, who find cameras that way). If the object is symmetric, the silhouettes that its
@@ -19,37 +19,36 @@ from torch import Tensor
 
 from gsopt.geometry.projection import project
 from gsopt.init.rounded_hull import squared_distance
-from gsopt.init.thumbnails import Photo, sample
+from gsopt.init.thumbnails import Thumbnail, sample
 from gsopt.symmetry.mirror import Mirror
 
-RAYS = 120
-"""Per photo: outline pixels, evenly spaced, that are asked."""
-SAMPLES = 64
-"""Points along a ray; around the best of them AROUND more."""
-AROUND = 9
-FINEST = 1024
-"""Outlines are drawn, where alpha passes one half, on a grid 2 or 4 times finer than the pixels, up to this long."""
-REACH = 12
+RAYS_PER_PHOTO = 120
+"""Outline pixels that are compared, evenly spaced."""
+SAMPLES, FINER = 64, 9
+"""Points along a ray, then more around the best of them."""
+MAX_GRID_SIDE = 1024
+"""Outlines, where alpha passes one half, lie on a grid 2 or 4 times finer than the pixels, up to this long."""
+MAX_DISTANCE = 12
 """Distance from the outline at which the signed distance ends, px."""
-SLACK = 1.5
-"""Points are tried where the photos themselves exclude them by no more than this, px."""
-FEWEST = 20
-"""Rays per photo below which nothing can be told: any mirror would do."""
-WORST = 4.0
-"""A pixel misses by this at most, px: one that sees another part of the object must not decide alone."""
+EXCLUSION_SLACK = 1.5
+"""Points are tried that the photos themselves exclude by no more than this, px."""
+MIN_RAYS = 20
+"""Rays per photo below which any mirror would fit."""
+MAX_MISS = 4.0
+"""Largest miss of a pixel, px: one that sees another part of the object must not decide alone."""
 
 
 @dataclass(frozen=True)
 class Outline:
     """One silhouette."""
 
-    photo: Photo
+    photo: Thumbnail
     distance: Float[Tensor, "1 FH FW"]
     """Signed, px, positive inside; on the finer grid."""
 
     @staticmethod
-    def of(photo: Photo) -> Outline:
-        finer = 4 if 4 * max(photo.camera.width, photo.camera.height) <= FINEST else 2
+    def of(photo: Thumbnail) -> Outline:
+        finer = 4 if 4 * max(photo.camera.width, photo.camera.height) <= MAX_GRID_SIDE else 2
         return Outline(photo, signed_distance(photo.alpha(), finer))
 
     def at(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
@@ -57,7 +56,7 @@ class Outline:
         column, row, depth = project(self.photo.camera, points.reshape(-1, 3))
         before = depth > 1e-6
         column, row = (torch.where(before, coordinate, 0.0) for coordinate in (column, row))
-        return torch.where(before, self.here(column, row), -float(REACH)).view(points.shape[:-1])
+        return torch.where(before, self.here(column, row), -float(MAX_DISTANCE)).view(points.shape[:-1])
 
     def here(self, column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Signed distance at pixel coordinates, px."""
@@ -66,9 +65,9 @@ class Outline:
 
 
 class Silhouettes:
-    """Outlines of the photos and the rays through them, ready to be asked about mirrors."""
+    """Outlines of the photos and the rays through them, for the comparison with mirrors."""
 
-    def __init__(self, photos: list[Photo], center: Float[Tensor, "3"], radius: float) -> None:
+    def __init__(self, photos: list[Thumbnail], center: Float[Tensor, "3"], radius: float) -> None:
         """All of the object lies within `radius` of `center`, scene units."""
         self.outlines = [Outline.of(photo) for photo in photos]
         rays = [_rays(outline, center, radius) for outline in self.outlines]
@@ -76,31 +75,31 @@ class Silhouettes:
         self._own = torch.cat([torch.full((len(origins),), row) for row, (origins, _, _) in enumerate(rays)])
         points = self._points(self._depths)
         others = self._among_others(points, self._own[:, None])
-        self._kept = others > -SLACK
+        self._kept = others > -EXCLUSION_SLACK
         self._kept_points, self._kept_others = points[self._kept], others[self._kept]
 
     @property
     def outline_something(self) -> bool:
-        """False for opaque pictures, whose alpha has no edge."""
-        return len(self._origins) >= FEWEST * len(self.outlines)
+        """False for opaque photos, whose alpha has no edge."""
+        return len(self._origins) >= MIN_RAYS * len(self.outlines)
 
     def misses(self, mirror: Mirror) -> Float[Tensor, "R"]:
-        """(1) for the rays of all photos, px, at most WORST."""
-        smallest = torch.full(self._kept.shape, -float(REACH))
+        """(1) for the rays of all photos, px, at most MAX_MISS."""
+        smallest = torch.full(self._kept.shape, -float(MAX_DISTANCE))
         smallest[self._kept] = torch.minimum(self._kept_others, self._behind(mirror, self._kept_points))
         best, index = smallest.max(1)
         # The best point lies between two samples.
         depth = self._depths.gather(1, index[:, None])
-        points = self._points(depth + torch.linspace(-1, 1, AROUND) * (self._depths[:, 1:2] - self._depths[:, :1]))
+        points = self._points(depth + torch.linspace(-1, 1, FINER) * (self._depths[:, 1:2] - self._depths[:, :1]))
         around = torch.minimum(self._among_others(points, self._own[:, None]), self._behind(mirror, points))
-        return (-torch.maximum(best, around.amax(1))).clamp(0, WORST)
+        return (-torch.maximum(best, around.amax(1))).clamp(0, MAX_MISS)
 
     def _points(self, depths: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
         return self._origins[:, None] + self._directions[:, None] * depths[..., None]
 
     def _among_others(self, points: Float[Tensor, "R S 3"], own: Int64[Tensor, "R 1"]) -> Float[Tensor, "R S"]:
         """The smallest signed distance in all photos but the ray's own."""
-        smallest = torch.full(points.shape[:-1], float(REACH))
+        smallest = torch.full(points.shape[:-1], float(MAX_DISTANCE))
         for index, outline in enumerate(self.outlines):
             smallest = torch.where(own == index, smallest, torch.minimum(smallest, outline.at(points)))
         return smallest
@@ -108,7 +107,7 @@ class Silhouettes:
     def _behind(self, mirror: Mirror, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
         """The smallest signed distance of the mirror image in all photos."""
         reflected = mirror.reflect(points)
-        smallest = torch.full(points.shape[:-1], float(REACH))
+        smallest = torch.full(points.shape[:-1], float(MAX_DISTANCE))
         for outline in self.outlines:
             smallest = torch.minimum(smallest, outline.at(reflected))
         return smallest
@@ -129,9 +128,10 @@ def _rays(
 
 
 def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, "1 FH FW"]:
-    """To the line where alpha passes one half, px, positive inside, ending at REACH; on a grid `finer` than pixels."""
+    """Signed distance to the line where alpha passes one half, px, positive inside, up to MAX_DISTANCE; the grid is
+    `finer` than the pixels."""
     planes = torch.nn.functional.interpolate(alpha[None], scale_factor=finer, mode="bilinear", align_corners=False)[0]
-    solid, reach = planes > 0.5, REACH * finer
+    solid, reach = planes > 0.5, MAX_DISTANCE * finer
     inner, outer = (
         squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~solid, solid)
     )
@@ -139,12 +139,12 @@ def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, 
 
 
 def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-    """Column and row of up to RAYS points on an outline: pixels at the silhouette's edge, moved onto the line.
-    Where an object is cut off by the border of the image there is none."""
+    """Column and row of up to RAYS_PER_PHOTO points on an outline: pixels at the silhouette's edge, moved onto it. The
+    border of the image, which cuts an object off, is no outline."""
     solid = outline.photo.alpha()[0] > 0.5
     beside = torch.nn.functional.max_pool2d((~solid)[None, None].float(), 3, 1, padding=1)[0, 0] > 0
     edge = torch.nonzero(solid & beside)
-    edge = edge[:: max(1, math.ceil(len(edge) / RAYS))]
+    edge = edge[:: max(1, math.ceil(len(edge) / RAYS_PER_PHOTO))]
     row, column = (edge + 0.5).unbind(1)
     for _ in range(2):
         here = outline.here(column, row)

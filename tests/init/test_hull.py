@@ -17,7 +17,7 @@ from gsopt.geometry.focus import find_focus
 from gsopt.geometry.projection import sees
 from gsopt.init import first_gaussians
 from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
-from gsopt.init.thumbnails import Photo, small_photos
+from gsopt.init.thumbnails import Thumbnail, small_photos
 
 CENTER, RADII = (0.3, -0.2, 0.1), (0.9, 0.6, 0.4)
 
@@ -90,7 +90,7 @@ def test_every_sampled_point_is_in_the_hull_and_the_surface_has_its_share(scene:
     assert float((radius < 0.5).double().mean()) > 0.01
 
 
-def test_colours_are_those_of_the_nearest_surface(found: HullPoints) -> None:
+def test_colors_are_those_of_the_nearest_surface(found: HullPoints) -> None:
     """Means over all views would mix both halves; only views that see the surface before a point may count."""
     away = (found.xyz[:, 0] - CENTER[0]) / RADII[0]
     for half, color in ((away > 0.35, RED), (away < -0.35, BLUE)):
@@ -151,13 +151,13 @@ def test_silhouettes_that_outline_nothing_fall_back_or_say_so(tmp_path: Path, al
         first_gaussians(scene, InitConfig(method="hull", count=50), 0, 0)
 
 
-def slid(photo: Photo, columns: int) -> Photo:
+def slid(photo: Thumbnail, columns: int) -> Thumbnail:
     """The same picture slid to the right, camera and all; what leaves it is cut off."""
     K = photo.camera.Ks.clone()
     K[:, 0, 2] += columns
     planes = torch.zeros_like(photo.planes)
     planes[..., columns:] = photo.planes[..., :-columns]
-    return Photo(replace(photo.camera, Ks=K), planes)
+    return Thumbnail(replace(photo.camera, Ks=K), planes)
 
 
 def beside(camera: Cameras, columns: float) -> torch.Tensor:
@@ -172,10 +172,10 @@ def test_what_a_photo_with_the_whole_object_does_not_show_is_no_part_of_it(scene
     whole, *more = small_photos(scene.train, 100)
     point = beside(whole.camera, 0.75 * whole.camera.width)
     full = torch.full_like(whole.planes, 255)
-    others = [Photo(photo.camera, full) for photo in more if bool(sees(photo.camera, point)[0])]
+    others = [Thumbnail(photo.camera, full) for photo in more if bool(sees(photo.camera, point)[0])]
     assert len(others) > 2
     assert not bool(in_hull([whole, *others], point)[0])
-    assert bool(in_hull([Photo(whole.camera, torch.zeros_like(full)), *others], point)[0])
+    assert bool(in_hull([Thumbnail(whole.camera, torch.zeros_like(full)), *others], point)[0])
 
 
 def test_an_object_that_its_photo_cuts_off_goes_on_beyond_the_edge(scene: Scene) -> None:
@@ -187,19 +187,19 @@ def test_an_object_that_its_photo_cuts_off_goes_on_beyond_the_edge(scene: Scene)
     assert bool(in_hull([cut, *others], inner).all())
 
 
-def test_a_ball_that_may_reach_into_the_picture_is_not_carved(scene: Scene) -> None:
-    """Whose centre lies just outside the whole object's photo; one far outside is, and so is every point."""
+def test_a_ball_that_may_reach_into_the_photo_is_not_carved(scene: Scene) -> None:
+    """Its center lies just outside the whole object's photo; a ball far outside is carved, and so is every point."""
     whole, *more = small_photos(scene.train, 100)
     half = whole.camera.width / 2
     near, far = beside(whole.camera, half + 1), beside(whole.camera, 4 * half)
     pixel = float((beside(whole.camera, 1) - beside(whole.camera, 0)).norm())
-    full = Photo(whole.camera, torch.full_like(whole.planes, 255))
+    full = Thumbnail(whole.camera, torch.full_like(whole.planes, 255))
     edge = full.planes.clone()
     edge[3, :, 0] = edge[3, :, -1] = edge[3, 0] = edge[3, -1] = 0
-    solid = Photo(whole.camera, edge)
+    solid = Thumbnail(whole.camera, edge)
     assert solid.shows_all()
     assert bool(in_hull([solid], beside(whole.camera, 0), 3 * pixel)[0])
-    others = [Photo(photo.camera, full.planes) for photo in more if bool(sees(photo.camera, near)[0])][:3]
+    others = [Thumbnail(photo.camera, full.planes) for photo in more if bool(sees(photo.camera, near)[0])][:3]
     assert bool(in_hull([solid, *others], near, 3 * pixel)[0])
     assert not bool(in_hull([solid, *others], near)[0])
     assert not bool(in_hull([solid, *others], far, 3 * pixel)[0])

@@ -1,4 +1,4 @@
-"""Nearest-neighbour distances against all pairs in float64."""
+"""Nearest-neighbor distances against all pairs in float64."""
 
 from __future__ import annotations
 

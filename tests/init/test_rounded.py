@@ -13,13 +13,15 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus
 from gsopt.geometry.voxels import Grid
 from gsopt.init.hull import carve
-from gsopt.init.rounded_hull import FAR, RATIO, rounded, squared_distance, thickest, thickness
-from gsopt.init.thumbnails import Photo, small_photos
+from gsopt.init.rounded_hull import FAR_SQUARED, RADIUS_RATIO, rounded, squared_distance, thickest, thickness
+from gsopt.init.thumbnails import Thumbnail, small_photos
 
 CENTER = (0.3, -0.2, 0.1)
 
 
-def hull_of(folder: Path, views: int, radii: tuple[float, float, float] = (0.7, 0.6, 0.65)) -> tuple[Grid, list[Photo]]:
+def hull_of(
+    folder: Path, views: int, radii: tuple[float, float, float] = (0.7, 0.6, 0.65)
+) -> tuple[Grid, list[Thumbnail]]:
     scene = load_scene(ellipsoid_scene(folder, spread_cameras(views), CENTER, radii))
     photos = small_photos(scene.train, views)
     grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
@@ -42,7 +44,7 @@ def test_the_distance_is_that_of_all_pairs() -> None:
     within = exact <= 4
     assert torch.equal(near[within], exact[within])
     assert bool((near >= exact).all())
-    assert bool((squared_distance(torch.zeros_like(cells), 3) == FAR).all())
+    assert bool((squared_distance(torch.zeros_like(cells), 3) == FAR_SQUARED).all())
 
 
 def test_the_thickness_of_a_ball_a_slab_and_a_rod() -> None:
@@ -55,7 +57,7 @@ def test_the_thickness_of_a_ball_a_slab_and_a_rod() -> None:
     thick = thickness(ball | slab | rod)
     for part, radius in ((ball, 12), (slab, 4), (rod, 3)):
         middle = thick[part].median()
-        assert radius / RATIO - 1 <= float(middle) <= radius + 1
+        assert radius / RADIUS_RATIO - 1 <= float(middle) <= radius + 1
     assert bool((thick[~(ball | slab | rod)] == 0).all())
     assert not bool(thickness(torch.zeros(4, 4, 4, dtype=torch.bool)).any())
 
@@ -98,6 +100,6 @@ def test_what_no_photo_shows_stays(tmp_path: Path) -> None:
 
 def test_a_point_on_the_border_belongs_to_the_last_pixel() -> None:
     K = torch.tensor([[[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]])
-    photo = Photo(Cameras(torch.eye(4)[None], K, 100, 100), torch.full((4, 100, 100), 255, dtype=torch.uint8))
+    photo = Thumbnail(Cameras(torch.eye(4)[None], K, 100, 100), torch.full((4, 100, 100), 255, dtype=torch.uint8))
     points = torch.tensor([[0.0, 0.5, 1.0], [0.5, 0.1, 1.0], [0.5, 0.5, 1.0]])
     assert thickest(photo, points, 0.001, torch.tensor([1.0, 2, 3])).tolist() == [1, 2, 3]

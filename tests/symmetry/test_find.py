@@ -1,4 +1,4 @@
-"""Which mirrors are found, and which are not."""
+"""Mirrors that are found, and planes that are not."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from PIL import Image
 
 from gsopt.data.scene import Scene, load_scene
 from gsopt.init.thumbnails import small_photos
-from gsopt.symmetry.find import COLORS, MISSES, Symmetry, find_symmetries, with_mirror_images
+from gsopt.symmetry.find import MAX_DISAGREEMENT, MAX_MISSES, Symmetry, find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
-from gsopt.symmetry.silhouettes import REACH, Outline, Silhouettes, outline_pixels, signed_distance
+from gsopt.symmetry.silhouettes import MAX_DISTANCE, Outline, Silhouettes, outline_pixels, signed_distance
 
 HALF = [Ball((0.5, 0.1, 0.0), 0.35), Ball((0.35, 0.5, 0.3), 0.2, (40, 90, 220)), Ball((0.6, -0.4, -0.2), 0.15)]
 """Beside the plane x = 0; with their mirror images nothing else about them is symmetric."""
@@ -41,7 +41,7 @@ def test_the_mirror_of_a_symmetric_thing_is_found(mirror: Mirror, tmp_path: Path
     assert degrees_between(found[0].mirror, mirror) < 1
     middle = torch.zeros(3) + mirror.offset * mirror.normal
     assert abs(float(found[0].mirror.distance(middle))) < 0.02
-    assert found[0].misses <= MISSES / 4
+    assert found[0].misses <= MAX_MISSES / 4
     assert found[0].colored
 
 
@@ -60,7 +60,7 @@ def test_a_thing_with_two_mirrors_has_both(tmp_path: Path) -> None:
 def test_paint_that_is_not_symmetric_is_noticed(tmp_path: Path) -> None:
     found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, slanted(), repaint=True)))
     assert [degrees_between(symmetry.mirror, slanted()) < 1 for symmetry in found] == [True]
-    assert found[0].disagreement > COLORS
+    assert found[0].disagreement > MAX_DISAGREEMENT
     assert not found[0].colored
 
 
@@ -81,7 +81,7 @@ def test_opaque_pictures_have_no_outline_either(tmp_path: Path) -> None:
 
 
 def test_the_border_of_a_picture_is_no_outline(tmp_path: Path) -> None:
-    """Of a ball that fills it from top to bottom only the sides are."""
+    """A ball that fills it from top to bottom has only its sides as outline."""
     scene = load_scene(write_balls(tmp_path / "ball", [Ball((0.0, 0.0, 0.0), 1.0)], ring(4, distance=3.6)))
     (photo,) = small_photos(scene.train[:1], 1)
     column, row = outline_pixels(Outline.of(photo))
@@ -115,14 +115,14 @@ def test_mirror_images_are_flipped_photos_seen_from_behind(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("finer", [2, 4])
 def test_the_signed_distance_is_that_to_the_outline(finer: int, tmp_path: Path) -> None:
-    """Of a disc: known at every pixel."""
+    """A disc has a known distance at every pixel."""
     scene = scene_of(tmp_path / "disc", [Ball((0.0, 0.0, 0.0), 0.6)])
     (photo,) = small_photos(scene.train[:1], 1)
     distance = signed_distance(photo.alpha(), finer)[0]
     y, x = (torch.arange(size, dtype=torch.float64) + 0.5 for size in distance.shape)
     from_center = ((x / finer - 48) ** 2 + (y[:, None] / finer - 48) ** 2).sqrt()
     radius = math.sqrt(float(photo.alpha().sum()) / math.pi)
-    expected = (radius - from_center).clamp(-REACH, REACH)
+    expected = (radius - from_center).clamp(-MAX_DISTANCE, MAX_DISTANCE)
     assert float((distance - expected).abs().max()) < 0.2 + 0.6 / finer
 
 

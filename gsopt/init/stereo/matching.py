@@ -1,9 +1,9 @@
-"""How well the pixels of one picture match others, if each shows a given plane.
+"""Matching costs of the pixels of one image against others, if each shows a given plane.
 
 A pixel's plane is its inverse depth as a function of the ray (x, y, 1): w = a x + b y + c. It is the same function for
-every pixel of one plane, so a neighbour's hypothesis needs no conversion, and the window around a pixel projects to
-another picture by two additions per tap. Windows are compared by normalised cross-correlation, their taps weighted by
-how near in place and brightness they are to the centre (Yoon & Kweon 2006; Schönberger et al. 2016).
+every pixel of one plane, so a neighbor's hypothesis needs no conversion, and the window around a pixel projects to
+another image by two additions per tap. Windows are compared by normalized cross-correlation, their taps weighted by
+how near in place and brightness they are to the center (Yoon & Kweon 2006; Schönberger et al. 2016).
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from gsopt.raster import _cpu  # type: ignore[attr-defined]
 
 RADIUS, STRIDE = 2, 2
 """A window is 5 x 5 taps, two pixels apart."""
-BRIGHTNESS = 0.1
+BRIGHTNESS_SCALE = 0.1
 """Difference, of 0..1, over which a tap's weight falls to 1/e."""
 LEAST_VARIANCE = 1e-5
-"""Of brightness in a window: noise, which must not look like texture."""
-UNSEEN = 2.0
-"""The cost where a window lies outside the other picture or behind it; the worst of any other."""
+"""Variance of brightness in a window below which it is noise, not texture."""
+UNSEEN_COST = 2.0
+"""The cost where a window lies outside the other image or behind it; the largest of all."""
 
 _STEPS = range(-RADIUS * STRIDE, RADIUS * STRIDE + 1, STRIDE)
 TAPS = [(float(dx), float(dy)) for dy in _STEPS for dx in _STEPS]
 
 
 class Matcher:
-    """The windows of one picture against `sources`; `workspace` as `cpu_backend.workspace` makes it."""
+    """The windows of one image against `sources`; `workspace` is from `cpu_backend.workspace`."""
 
     def __init__(self, reference: StereoImage, sources: Sequence[StereoImage], workspace: Any) -> None:
         self._workspace = workspace
@@ -49,7 +49,7 @@ class Matcher:
             1 / float(K[0, 0]),
             1 / float(K[1, 1]),
             LEAST_VARIANCE,
-            UNSEEN,
+            UNSEEN_COST,
         )
         self._sources = [(corners(source.gray), *_motion(reference, source)) for source in sources]
 
@@ -64,7 +64,7 @@ class Matcher:
 
 
 def windows(gray: Float[Tensor, "H W"]) -> tuple[Float[Tensor, "25 H W"], Float[Tensor, "25 H W"]]:
-    """Of every pixel: the weights of its taps, of sum 1, and their brightness less the weighted mean."""
+    """Weights of the taps of every pixel, of sum 1, and their brightness less the weighted mean."""
     height, width = gray.shape
     reach = RADIUS * STRIDE
     padded = torch.nn.functional.pad(gray[None], (reach,) * 4, mode="replicate")[0]
@@ -73,7 +73,7 @@ def windows(gray: Float[Tensor, "H W"]) -> tuple[Float[Tensor, "25 H W"], Float[
     ]
     values = torch.stack(taps)
     distance = torch.tensor(TAPS).square().sum(1).sqrt() / (2 * reach)
-    weights = torch.exp(-(values - gray).abs() / BRIGHTNESS - distance[:, None, None])
+    weights = torch.exp(-(values - gray).abs() / BRIGHTNESS_SCALE - distance[:, None, None])
     weights = weights / weights.sum(0)
     return weights, values - (weights * values).sum(0)
 

@@ -15,97 +15,97 @@ from gsopt.geometry.projection import inside, project
 from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.matching import Matcher
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
-from gsopt.init.thumbnails import Photo, small_photos
+from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.cpu_backend import workspace
 
-PHOTOS = 16
+MAX_PHOTOS = 16
 """Photos that are matched, the farthest apart."""
-SOURCES = 5
+SOURCES_PER_PHOTO = 5
 """Others that each is matched with, the nearest."""
 LEVELS = ((8_000, 8, 1.0), (32_000, 3, 0.02))
-"""Pixels, rounds, and first step of the search: where things are is found in small pictures, exactly in larger ones."""
-NEAR, FAR = 0.25, 50.0
+"""Pixels, rounds, and first step of the search: coarse in small images, exact in larger ones."""
+NEAR_DEPTH, FAR_DEPTH = 0.25, 50.0
 """Depths that are searched, in distances to the focus."""
-SAME_DEPTH, SAME_PLACE, MATCHED, ANGLE = 0.02, 2.0, 0.4, 1.0
-"""Two photos agree on a point where their depths differ by less than this share, the pixel it comes back to is less
-than so many pixels away, both match no worse than this cost, and they see it from directions so many degrees apart: a
-camera that only turns says nothing of depth."""
+MAX_DEPTH_DIFFERENCE, MAX_PIXEL_SHIFT, MAX_COST, MIN_ANGLE = 0.02, 2.0, 0.4, 1.0
+"""Two photos agree on a point if their depths differ by less than this share, it projects back to less than so many
+pixels away, both match at less than this cost, and they see it from directions so many degrees apart: a camera that
+only turns measures no depth."""
 
 
 @dataclass(frozen=True)
 class StereoPoints:
-    """Places on surfaces, and their colours."""
+    """Points on surfaces, and their colors."""
 
     xyz: Float[Tensor, "N 3"]
     rgb: Float[Tensor, "N 3"]
     """0..1."""
     photos: int
-    """That were matched."""
+    """Number of photos that were matched."""
     share: float
-    """Of their pixels on which another photo agrees."""
+    """Share of their pixels on which another photo agrees."""
 
 
 def stereo_points(scene: Scene, count: int, generator: torch.Generator) -> StereoPoints:
     """Up to `count` of the places on which photos agree, drawn at random. Fewer than two photos agree on none."""
-    photos = small_photos(scene.train, PHOTOS)
+    photos = small_photos(scene.train, MAX_PHOTOS)
     focus = find_focus([view.camera for view in scene.train], scene.extent)
     maps = plane_maps(photos, focus, generator) if len(photos) > 1 else []
     kept = [agreed(each, [other for other in maps if other is not each]) for each in maps]
     nothing = torch.empty(0, 3)
-    xyz = [each.picture.points(each.inverse_depths())[keep] for each, keep in zip(maps, kept, strict=True)]
-    rgb = [each.picture.rgb.permute(1, 2, 0)[keep] for each, keep in zip(maps, kept, strict=True)]
+    xyz = [each.image.points(each.inverse_depths())[keep] for each, keep in zip(maps, kept, strict=True)]
+    rgb = [each.image.rgb.permute(1, 2, 0)[keep] for each, keep in zip(maps, kept, strict=True)]
     found = torch.cat([*xyz, nothing])
     chosen = torch.randperm(len(found), generator=generator)[:count]
     share = len(found) / max(1, sum(keep.numel() for keep in kept))
     return StereoPoints(found[chosen], torch.cat([*rgb, nothing])[chosen], len(photos), share)
 
 
-def plane_maps(photos: Sequence[Photo], focus: Focus, generator: torch.Generator) -> list[PlaneMap]:
-    """The planes that the pixels of each photo show, whether others agree or not."""
-    reach = Reach(1 / (FAR * focus.distance), 1 / (NEAR * focus.distance))
+def plane_maps(photos: Sequence[Thumbnail], focus: Focus, generator: torch.Generator) -> list[PlaneMap]:
+    """The planes that the pixels of each photo show, confirmed by others or not."""
+    reach = Reach(1 / (FAR_DEPTH * focus.distance), 1 / (NEAR_DEPTH * focus.distance))
     threads = workspace(torch.get_num_threads())
     maps: list[PlaneMap] = []
     for pixels, rounds, shake in LEVELS:
-        pictures = [StereoImage.of(photo, pixels) for photo in photos]
+        images = [StereoImage.of(photo, pixels) for photo in photos]
         starts = [
-            maps[index].enlarged(picture) if maps else random_planes(picture, reach, generator)
-            for index, picture in enumerate(pictures)
+            maps[index].enlarged(image) if maps else random_planes(image, reach, generator)
+            for index, image in enumerate(images)
         ]
         maps = []
-        for picture, start in zip(pictures, starts, strict=True):
-            matcher = Matcher(picture, nearest(picture, pictures, focus), threads)
-            maps.append(Search(picture, matcher, reach, start).run(rounds, shake, generator))
+        for image, start in zip(images, starts, strict=True):
+            matcher = Matcher(image, nearest(image, images, focus), threads)
+            maps.append(Search(image, matcher, reach, start).run(rounds, shake, generator))
     return maps
 
 
-def nearest(picture: StereoImage, pictures: Sequence[StereoImage], focus: Focus) -> list[StereoImage]:
-    """The others that most likely show the same: near in place and direction."""
+def nearest(image: StereoImage, images: Sequence[StereoImage], focus: Focus) -> list[StereoImage]:
+    """The others that most likely show the same: near in position and direction."""
 
-    def apart(other: StereoImage) -> float:
-        away = (other.camera.centers[0] - picture.camera.centers[0]).norm()
-        turned = 1 - (other.camera.forwards[0] * picture.camera.forwards[0]).sum()
+    def distance(other: StereoImage) -> float:
+        away = (other.camera.centers[0] - image.camera.centers[0]).norm()
+        turned = 1 - (other.camera.forwards[0] * image.camera.forwards[0]).sum()
         return float(away + 2 * focus.distance * turned)
 
-    return sorted((other for other in pictures if other is not picture), key=apart)[:SOURCES]
+    return sorted((other for other in images if other is not image), key=distance)[:SOURCES_PER_PHOTO]
 
 
 def agreed(here: PlaneMap, others: Sequence[PlaneMap]) -> Bool[Tensor, "H W"]:
     """Pixels whose point another photo places there as well."""
-    column, row = here.picture.pixels
-    points = here.picture.points(here.inverse_depths()).view(-1, 3)
+    column, row = here.image.pixels
+    points = here.image.points(here.inverse_depths()).view(-1, 3)
     found = torch.zeros(len(points), dtype=torch.bool)
     for other in others:
-        camera = other.picture.camera
+        camera = other.image.camera
         there = project(camera, points)
         rows = torch.nonzero(inside(camera, *there))[:, 0]
         x, y = (there[0][rows].long().clamp(0, camera.width - 1), there[1][rows].long().clamp(0, camera.height - 1))
         w = other.inverse_depths()
-        same_depth = (1 / w[y, x] / there[2][rows] - 1).abs() < SAME_DEPTH
-        back = project(here.picture.camera, other.picture.points(w)[y, x])
+        same_depth = (1 / w[y, x] / there[2][rows] - 1).abs() < MAX_DEPTH_DIFFERENCE
+        back = project(here.image.camera, other.image.points(w)[y, x])
         moved = torch.hypot(back[0] - column.flatten()[rows], back[1] - row.flatten()[rows])
-        matched = (moved < SAME_PLACE) & (other.costs[y, x] < MATCHED)
-        found[rows] |= same_depth & matched & (_angles(points[rows], here.picture, other.picture) > ANGLE)
-    return found.view(here.costs.shape) & (here.costs < MATCHED)
+        matched = (moved < MAX_PIXEL_SHIFT) & (other.costs[y, x] < MAX_COST)
+        found[rows] |= same_depth & matched & (_angles(points[rows], here.image, other.image) > MIN_ANGLE)
+    return found.view(here.costs.shape) & (here.costs < MAX_COST)
 
 
 def _angles(points: Float[Tensor, "N 3"], one: StereoImage, other: StereoImage) -> Float[Tensor, "N"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsopt.geometry.cameras import Cameras
 from gsopt.init.stereo.image import StereoImage
-from gsopt.init.stereo.matching import LEAST_VARIANCE, TAPS, UNSEEN, Matcher, windows
+from gsopt.init.stereo.matching import LEAST_VARIANCE, TAPS, UNSEEN_COST, Matcher, windows
 from gsopt.raster import _cpu
 from gsopt.raster.cpu_backend import ISA_VARIABLE, workspace
 
@@ -19,10 +19,10 @@ COST = 2e-4
 """A correlation of float32 numbers whose variance may be as small as LEAST_VARIANCE: mean square less squared mean
 loses 1e-7 / 1e-5, and a hundredth of a pixel moves a value by 1e-5."""
 BORDER = 1e-3
-"""Windows whose outermost tap lies so near the other picture's border, in pixels, are left out: it decides all."""
+"""Windows whose outermost tap lies so near the other image's border, in pixels, are left out: it decides all."""
 
 
-def picture(seed: int, viewmat: Tensor, width: int = 40, height: int = 30) -> StereoImage:
+def image(seed: int, viewmat: Tensor, width: int = 40, height: int = 30) -> StereoImage:
     generator = torch.Generator().manual_seed(seed)
     K = torch.tensor([[1.1 * width, 0, 0.45 * width], [0, 1.2 * width, 0.55 * height], [0, 0, 1]])
     coarse = torch.rand(1, 3, 6, 8, generator=generator)
@@ -68,14 +68,14 @@ def plain_costs(reference: StereoImage, source: StereoImage, planes: Tensor) -> 
     product = (weights * centered * difference).sum(0)
     cost = 1 - product / ((variance + LEAST_VARIANCE) * (own + LEAST_VARIANCE)).sqrt()
     least = torch.stack(slack).amin(0)
-    return torch.where(least >= 0, cost, UNSEEN), least
+    return torch.where(least >= 0, cost, UNSEEN_COST), least
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
 @pytest.mark.parametrize("isa", _cpu.instruction_sets())
 def test_costs_are_those_of_float64(isa: str, seed: int) -> None:
-    reference, source = picture(seed, torch.eye(4)), picture(seed + 1, moved(seed))
+    reference, source = image(seed, torch.eye(4)), image(seed + 1, moved(seed))
     generator = torch.Generator().manual_seed(seed)
     planes = torch.rand(3, *reference.gray.shape, generator=generator) * torch.tensor([0.4, 0.4, 1.0])[:, None, None]
     planes[2] += 0.3
@@ -90,19 +90,19 @@ def test_costs_are_those_of_float64(isa: str, seed: int) -> None:
 
 def test_some_windows_are_seen_and_some_are_not() -> None:
     """Else the test above would compare constants."""
-    reference, source = picture(3, torch.eye(4)), picture(3, moved(3))
+    reference, source = image(3, torch.eye(4)), image(3, moved(3))
     planes = torch.zeros(3, *reference.gray.shape)
     planes[2] = 0.8
     wanted, _ = plain_costs(reference, source, planes.double())
-    assert 0.2 < float((wanted < UNSEEN).double().mean()) < 0.98
+    assert 0.2 < float((wanted < UNSEEN_COST).double().mean()) < 0.98
 
 
-def test_a_picture_matches_itself_and_not_its_negative() -> None:
-    one = picture(5, torch.eye(4))
+def test_a_image_matches_itself_and_not_its_negative() -> None:
+    one = image(5, torch.eye(4))
     negative = StereoImage(one.camera, 1 - one.rgb)
     planes = torch.ones(3, *one.gray.shape)
     same, opposite = Matcher(one, [one, negative], workspace(1)).costs(planes)
-    seen = same < UNSEEN
+    seen = same < UNSEEN_COST
     textured = windows(one.gray)[1].square().mean(0) > 1e-3
     assert bool((seen & textured).any())
     assert float(same[seen & textured].max()) < 0.02
@@ -110,17 +110,17 @@ def test_a_picture_matches_itself_and_not_its_negative() -> None:
 
 
 def test_what_shows_nothing_matches_nothing() -> None:
-    blank = StereoImage(picture(1, torch.eye(4)).camera, torch.full((3, 30, 40), 0.4))
+    blank = StereoImage(image(1, torch.eye(4)).camera, torch.full((3, 30, 40), 0.4))
     (cost,) = Matcher(blank, [blank], workspace(1)).costs(torch.ones(3, 30, 40))
-    assert float((cost[cost < UNSEEN] - 1).abs().max()) < 0.05
+    assert float((cost[cost < UNSEEN_COST] - 1).abs().max()) < 0.05
 
 
 def test_planes_that_are_not_numbers_or_lie_behind_are_unseen() -> None:
-    one = picture(2, torch.eye(4))
+    one = image(2, torch.eye(4))
     for value in (float("nan"), float("inf"), -float("inf")):
         planes = torch.full((3, 30, 40), value)
-        (cost,) = Matcher(one, [picture(2, moved(2))], workspace(1)).costs(planes)
-        assert bool((cost == UNSEEN).all())
+        (cost,) = Matcher(one, [image(2, moved(2))], workspace(1)).costs(planes)
+        assert bool((cost == UNSEEN_COST).all())
 
 
 def test_the_rooms_own_floor_matches_better_than_another(tmp_path) -> None:

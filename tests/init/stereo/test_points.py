@@ -29,7 +29,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def test_points_lie_on_the_surfaces(scene: Scene) -> None:
-    """Some four units away, and a pixel of the matched pictures is two hundredths of a unit wide there."""
+    """Some four units away, and a pixel of the matched images is two hundredths of a unit wide there."""
     found = points_of(scene)
     assert len(found.xyz) == COUNT
     assert found.photos == 4
