@@ -105,16 +105,16 @@ def find_features(pycolmap: Any, options: argparse.Namespace) -> dict[str, Any]:
 
     config = SfmConfig(threads=1)
     read, _ = photos.read_photos(input_photos(options), options.work)
-    masked = masks(options, read)
+    inputs = masks(options, read)
     database = options.work / "database.db"
     chosen = time.process_time()
-    features.extract(pycolmap, database, read, masked, config)
+    features.extract(pycolmap, database, read, inputs, config)
     extracted = time.process_time()
     matching = features.choose_matching(config, len(read), options.video)
     graph = features.match(pycolmap, database, [photo.name for photo in read], matching, config, print)
     return {
         "photos": len(read),
-        "masks": masked.kind,
+        "masks": inputs.kind,
         "matching": matching,
         "pairs_with_matches": len(graph.inliers),
         "extraction_cpu_seconds": round(extracted - chosen, 1),
@@ -130,7 +130,7 @@ def masks(options: argparse.Namespace, read: list[Any]) -> Any:
 
 def find_poses(pycolmap: Any, options: argparse.Namespace, mapper: str) -> dict[str, Any]:
     from gsopt.data.sfm import features, mapping, pipeline, placement, write_scene
-    from gsopt.data.sfm.masks import Masked
+    from gsopt.data.sfm.masks import FeatureInput
     from gsopt.data.sfm.settings import SfmConfig
 
     work = options.work / f"{mapper}-work"
@@ -152,8 +152,8 @@ def find_poses(pycolmap: Any, options: argparse.Namespace, mapper: str) -> dict[
         "track_length": round(found.compute_mean_track_length(), 3),
         "points": found.num_points3D(),
     }
-    masked = Masked(opaque, None, "none", [])
-    write_scene.write_scene(pycolmap, found, work, masked, similarity, undistort=True).rename(options.work / mapper)
+    inputs = FeatureInput(opaque, None, "none", [])
+    write_scene.write_scene(pycolmap, found, work, inputs, similarity, undistort=True).rename(options.work / mapper)
     return figures | trajectory(options, options.work / mapper)
 
 

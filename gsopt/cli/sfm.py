@@ -31,12 +31,12 @@ def main(argv: Sequence[str]) -> int:
     """Find the poses, print the diagnosis and return 0."""
     flags = tyro.cli(Flags, prog="gsopt sfm", args=list(argv))
 
-    from gsopt.data.sfm.pipeline import PICTURE, pose_photos
+    from gsopt.data.sfm.pipeline import OVERVIEW, pose_photos
 
     posed = pose_photos(flags.photos, flags.out or posed_name(flags.photos), flags.config, report)
     for line in posed.diagnosis.lines():
         print(line)
-    print(f"{posed.path}: cameras and points in {PICTURE}; train with: gsopt train {posed.path}")
+    print(f"{posed.path}: cameras and points in {OVERVIEW}; train with: gsopt train {posed.path}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with a dataset is said in one message: what, got, do."""
+"""Every fault of a dataset has one message: what, got, do."""
 
 from __future__ import annotations
 

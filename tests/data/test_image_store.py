@@ -80,7 +80,7 @@ def test_every_mode_becomes_rgb_or_rgba(tmp_path: Path, mode: str, channels: int
     assert read_pixels(tmp_path / "a.png").shape == (3, 5, channels)
 
 
-def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path: Path) -> None:
+def test_sixteen_bit_gray_is_scaled_not_clipped(tmp_path: Path) -> None:
     Image.fromarray(np.full((2, 2), 0x8000, dtype=np.uint16)).save(tmp_path / "a.png")
     assert read_pixels(tmp_path / "a.png").unique().tolist() == [0x80]
 

@@ -36,7 +36,7 @@ def test_sizes_are_rounded_as_the_published_folders_are(extent: int, factor: int
     assert downscaled_size(extent, factor) == want
 
 
-def test_premultiplying_and_back_keeps_every_opaque_and_half_transparent_colour() -> None:
+def test_premultiplying_and_back_keeps_every_opaque_and_half_transparent_color() -> None:
     alpha = torch.tensor([255, 254, 128, 1, 0], dtype=torch.uint8)
     pixels = torch.randint(0, 256, (5, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     rgba = torch.cat([pixels, alpha[:, None, None].expand(5, 64, 1)], dim=2)
@@ -45,7 +45,7 @@ def test_premultiplying_and_back_keeps_every_opaque_and_half_transparent_colour(
     assert int(back[4].max()) == 0
 
 
-def test_transparent_colours_do_not_bleed_into_the_edge() -> None:
+def test_transparent_colors_do_not_bleed_into_the_edge() -> None:
     rgba = torch.zeros(2, 2, 4, dtype=torch.uint8)
     rgba[0, 0] = torch.tensor([200, 100, 50, 255])
     rgba[1, 1] = torch.tensor([0, 255, 255, 0])

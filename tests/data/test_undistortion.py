@@ -53,7 +53,7 @@ def thin_prism(p, u, v):
     )
 
 
-# model, COLMAP's parameters, normalised (u, v) -> normalised distorted, fx, fy, cx, cy
+# model, COLMAP's parameters, normalized (u, v) -> normalized distorted, fx, fy, cx, cy
 MODELS = {
     "SIMPLE_PINHOLE": ((200, 160, 120), lambda u, v: (u, v)),
     "PINHOLE": ((200, 210, 158, 123), lambda u, v: (u, v)),

@@ -1,1 +1,1 @@
-"""From photos or a film to a posed scene. Read `pipeline.py` first; `settings.py` needs no heavy import."""
+"""Structure from motion: from photos or a video to a posed scene. Start with `pipeline.py`."""

@@ -1,4 +1,4 @@
-"""What a person needs to know: how many photos were placed, which were not and why, and what to do about it."""
+"""The report of a run: photos placed, photos without a pose and the reasons, and advice."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from gsopt.data.sfm.features import ViewGraph
-from gsopt.data.sfm.photos import Photo, Refused, natural
+from gsopt.data.sfm.photos import Photo, RejectedFile, natural
 
-BLURRED = 0.25
+BLURRED_SHARE = 0.25
 """Share of the set's median sharpness below which a photo counts as blurred."""
 FEW_FEATURES = 200
-WEAK = 30
+MIN_COMMON_FEATURES = 30
 """Features in common below which a pair cannot carry a pose."""
-PLAIN = 4.0
-"""Grey levels a picture must vary by before lack of detail can be blur."""
-WIDE_GAP = 35.0
+PLAIN_CONTRAST = 4.0
+"""Gray levels a photo must vary by before lack of detail can be blur."""
+WIDE_GAP_DEGREES = 35.0
 """Degrees between neighboring viewing directions above which more photos are advised."""
 REASONS = {
     "blurred": "blurred",
@@ -42,7 +42,7 @@ REMEDIES = {
 
 
 @dataclass(frozen=True)
-class Left:
+class UnplacedPhoto:
     """A photo without a pose."""
 
     name: str
@@ -55,18 +55,18 @@ class Left:
 
 @dataclass
 class Diagnosis:
-    """What is said about one run."""
+    """Findings about one run."""
 
     given: int
-    """Files that were looked at."""
+    """Number of input files."""
     registered: list[str]
-    left: list[Left]
+    left: list[UnplacedPhoto]
     advice: list[str] = field(default_factory=list)
     mapper: str = ""
     reprojection_error: float | None = None
     """Mean, px of the full-size photos."""
     track_length: float | None = None
-    """Mean number of photos a point is seen in."""
+    """Mean number of photos per point."""
     points: int = 0
 
     def headline(self) -> str:
@@ -90,15 +90,15 @@ class Diagnosis:
 
 
 def explain(
-    photos: Sequence[Photo], refused: Sequence[Refused], graph: ViewGraph | None, registered: set[str]
+    photos: Sequence[Photo], refused: Sequence[RejectedFile], graph: ViewGraph | None, registered: set[str]
 ) -> Diagnosis:
     """Reasons for every file without a pose, and advice that follows from them."""
-    left = [Left(item.name, "refused", item.reason) for item in refused]
+    left = [UnplacedPhoto(item.name, "refused", item.reason) for item in refused]
     usual = statistics.median(photo.sharpness for photo in photos) if photos else 0.0
     for photo in photos:
         if photo.name not in registered:
-            kind, detail = why_left(photo, graph, registered, usual)
-            left.append(Left(photo.name, kind, REASONS[kind], detail))
+            kind, detail = why_unplaced(photo, graph, registered, usual)
+            left.append(UnplacedPhoto(photo.name, kind, REASONS[kind], detail))
     names = [photo.name for photo in photos if photo.name in registered]
     diagnosis = Diagnosis(len(photos) + len(refused), names, left)
     diagnosis.advice += gaps([photo.name for photo in photos], registered)
@@ -107,13 +107,17 @@ def explain(
     return diagnosis
 
 
-def why_left(photo: Photo, graph: ViewGraph | None, registered: set[str], usual: float) -> tuple[str, str]:
+def why_unplaced(photo: Photo, graph: ViewGraph | None, registered: set[str], usual: float) -> tuple[str, str]:
     """(kind, figures) of a photo that was read but has no pose."""
     if graph is None:
         return "alone", ""
     features, partners = graph.features.get(photo.name, 0), graph.partners(photo.name)
     few = features < FEW_FEATURES
-    if photo.sharpness < BLURRED * usual and photo.contrast > PLAIN and (few or sum(partners.values()) < WEAK):
+    if (
+        photo.sharpness < BLURRED_SHARE * usual
+        and photo.contrast > PLAIN_CONTRAST
+        and (few or sum(partners.values()) < MIN_COMMON_FEATURES)
+    ):
         return "blurred", f"sharpness {photo.sharpness:.3f}, usual is {usual:.3f}"
     if few:
         return "featureless", f"{features} features"
@@ -147,12 +151,12 @@ def gaps(names: Sequence[str], registered: set[str]) -> list[str]:
 
 
 def wide_gaps(names: Sequence[str], viewmats: Float[np.ndarray, "C 4 4"]) -> list[str]:
-    """Neighbors in name order whose viewing directions differ much more than usual: too little overlap to be sure."""
+    """Neighbors in name order whose viewing directions differ much more than usual: too little overlap."""
     forwards = viewmats[:, 2, :3]
     turns = np.degrees(np.arccos(np.clip(np.einsum("ci,ci->c", forwards[:-1], forwards[1:]), -1, 1)))
     if len(turns) < 2:
         return []
-    limit = max(WIDE_GAP, 3 * float(np.median(turns)))
+    limit = max(WIDE_GAP_DEGREES, 3 * float(np.median(turns)))
     return [
         f"Add photos between {names[i]} and {names[i + 1]}: their directions differ by {turns[i]:.0f} degrees."
         for i in np.flatnonzero(turns > limit)[:5]

@@ -1,4 +1,4 @@
-"""The feature database: cameras, SIFT features, which photos are compared, and what they have in common."""
+"""The feature database: cameras, SIFT features, the compared pairs, and their matches."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from gsopt.data.sfm.masks import Masked
+from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.photos import Photo
 from gsopt.data.sfm.retrieval import similar_pairs
 from gsopt.data.sfm.settings import SfmConfig
@@ -17,20 +17,20 @@ from gsopt.events import Report
 
 Pair = tuple[str, str]
 
-ENOUGH_FOR_RADIAL = 20
+RADIAL_FROM = 20
 """Photos with one camera from which on two lens terms are found reliably. Both axes always have one focal length:
 cameras that go round an object at one height leave the vertical one open (a rendered orbit: 7 times the true one)."""
 EXHAUSTIVE_UP_TO = 200
 NEIGHBORS_IN_TIME = 10
-LOOPS, LOOK_ALIKES = 5, 30
-"""Look-alikes each photo is compared with: to close loops of a video, and instead of all others."""
-_PAIRS_AT_ONCE = 400
-"""Progress is told in between."""
+LOOP_PARTNERS, SIMILAR_PARTNERS = 5, 30
+"""Similar photos that each photo is compared with: to close loops of a video, and instead of all others."""
+_PAIRS_PER_BATCH = 400
+"""Pairs between two lines of progress."""
 
 
 @dataclass(frozen=True)
 class ViewGraph:
-    """What feature matching found, by photo name."""
+    """Features and matches, by photo name."""
 
     features: dict[str, int]
     inliers: dict[Pair, int]
@@ -44,7 +44,7 @@ class ViewGraph:
         return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
 
     def is_still(self, a: str, b: str) -> bool:
-        """Whether the pair alone carries no depth."""
+        """True when the pair alone carries no depth."""
         return (a, b) in self.still or (b, a) in self.still
 
     def groups(self) -> list[set[str]]:
@@ -58,7 +58,9 @@ class ViewGraph:
         return sorted(distinct, key=lambda members: (-len(members), min(members)))
 
 
-def extract(pycolmap: ModuleType, database: Path, photos: Sequence[Photo], masked: Masked, config: SfmConfig) -> None:
+def extract(
+    pycolmap: ModuleType, database: Path, photos: Sequence[Photo], inputs: FeatureInput, config: SfmConfig
+) -> None:
     """Features of all photos, one camera for each lens, zoom and size."""
     pycolmap.Database.open(database).close()  # makes it
     options = pycolmap.FeatureExtractionOptions()
@@ -67,14 +69,14 @@ def extract(pycolmap: ModuleType, database: Path, photos: Sequence[Photo], maske
     options.sift.max_num_features = config.features
     for shared in cameras(photos):
         reader = reader_options(pycolmap, shared, config)
-        if masked.masks is not None:
-            reader.mask_path = masked.masks
+        if inputs.masks is not None:
+            reader.mask_path = inputs.masks
         names = [photo.name for photo in shared]
         # Listed first, in order: threads that finish in any order would number the photos in any order.
-        pycolmap.import_images(database, masked.photos, pycolmap.CameraMode.SINGLE, names, reader)
+        pycolmap.import_images(database, inputs.photos, pycolmap.CameraMode.SINGLE, names, reader)
         pycolmap.extract_features(
             database,
-            masked.photos,
+            inputs.photos,
             image_names=names,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
@@ -94,7 +96,7 @@ def reader_options(pycolmap: ModuleType, shared: Sequence[Photo], config: SfmCon
     """Lens model and first guess for photos of one camera."""
     model = config.camera_model
     if model == "auto":
-        model = "RADIAL" if len(shared) >= ENOUGH_FOR_RADIAL else "SIMPLE_RADIAL"
+        model = "RADIAL" if len(shared) >= RADIAL_FROM else "SIMPLE_RADIAL"
     options = pycolmap.ImageReaderOptions()
     options.camera_model = model
     focal = config.focal or shared[0].focal
@@ -105,7 +107,7 @@ def reader_options(pycolmap: ModuleType, shared: Sequence[Photo], config: SfmCon
 
 
 def choose_matching(config: SfmConfig, count: int, is_video: bool) -> str:
-    """What `auto` becomes."""
+    """The matching that `auto` resolves to."""
     if config.matching != "auto":
         return config.matching
     if is_video:
@@ -124,8 +126,8 @@ def match(
     verification.ransac.random_seed = config.seed
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = database.with_name("pairs.txt")
-    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
-        part = pairs[start : start + _PAIRS_AT_ONCE]
+    for start in range(0, len(pairs), _PAIRS_PER_BATCH):
+        part = pairs[start : start + _PAIRS_PER_BATCH]
         pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in part), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, matching_options=options, pairing_options=pairing, verification_options=verification
@@ -141,7 +143,7 @@ def pairs_to_match(pycolmap: ModuleType, database: Path, names: Sequence[str], m
     pairs = set(neighbors_in_time(names))
     if len(names) > NEIGHBORS_IN_TIME:
         descriptors = read_descriptors(pycolmap, database, names)
-        most = LOOPS if matching == "sequential" else LOOK_ALIKES
+        most = LOOP_PARTNERS if matching == "sequential" else SIMILAR_PARTNERS
         pairs |= {(names[i], names[j]) for i, j in similar_pairs(descriptors, most, seed)}
     rank = {name: position for position, name in enumerate(names)}
     return sorted(pairs, key=lambda pair: (rank[pair[0]], rank[pair[1]]))

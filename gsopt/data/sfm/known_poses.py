@@ -1,4 +1,4 @@
-"""Poses that are known already: kept as they are, and points found for them by triangulation."""
+"""Known poses: kept as they are, with points from triangulation."""
 
 from __future__ import annotations
 

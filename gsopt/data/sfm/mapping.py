@@ -20,30 +20,30 @@ from gsopt.events import Report
 
 INCREMENTAL_UP_TO = 300
 """Photos up to which `auto` maps incrementally: slower per photo, but it loses fewer."""
-SATISFIED = 0.9
+ENOUGH_PLACED = 0.9
 """Share of the photos below which `auto` tries the other mapper."""
 SMALLEST_MODEL = 3
-FEWEST_POINTS = 15
+MIN_SHARED_POINTS = 15
 """Points a photo must share with another one for its pose to count."""
 SEED_PHOTOS = 16
-"""Best connected photos that are mapped incrementally first where global mapping has to be told the focal length."""
+"""Best connected photos that are mapped incrementally first where global mapping needs the focal length."""
 TRIANGULATIONS = 2
-"""How often the points of a global model are made anew from all matches; each time the poses are adjusted to them."""
-ENOUGH_FOR_CENTER = 10
+"""Rounds in which the points of a global model are triangulated again from all matches and the poses adjusted."""
+CENTER_FROM = 10
 """Photos of one camera from which on an adjustment may move its principal point."""
-MOST_OFF_CENTER = 0.03
-"""How far from the middle it may then lie, as a share of the photo's width or height. Where a camera went round an
-object at one height, a shift of all photos looks like a turn of all cameras: 13 % and 5 degrees on a rendered orbit."""
+MAX_OFF_CENTER = 0.03
+"""Largest offset from the middle then, as a share of the photo's width or height. Around an object at one height, a
+shift of all photos looks like a turn of all cameras: 13 % and 5 degrees on a rendered orbit."""
 
 
 @dataclass(frozen=True)
-class Mapped:
+class MappingResult:
     """The largest reconstruction that was found."""
 
     reconstruction: Any
     """pycolmap.Reconstruction."""
     mapper: str
-    """Which one made it."""
+    """Name of the mapper."""
     others: list[set[str]]
     """Photos of smaller reconstructions that could not be joined to it."""
 
@@ -60,9 +60,9 @@ def registered(reconstruction: Any) -> set[str]:
 
 def find_poses(
     pycolmap: ModuleType, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig, report: Report
-) -> Mapped | None:
-    """The best reconstruction of the mappers that `config.mapper` allows; None when no three photos fit together."""
-    best: Mapped | None = None
+) -> MappingResult | None:
+    """The best reconstruction of the mappers that `config.mapper` allows, or None if no three photos fit together."""
+    best: MappingResult | None = None
     count = len(graph.features)
     for mapper in mappers_to_try(config, count):
         models = run_mapper(pycolmap, mapper, database, photos, graph, config)
@@ -71,11 +71,11 @@ def find_poses(
             continue
         largest = models[0]
         others = [registered(model) - registered(largest) for model in models[1:]]
-        mapped = Mapped(largest, mapper, [names for names in others if names])
+        mapped = MappingResult(largest, mapper, [names for names in others if names])
         report(f"{mapper} mapping placed {len(mapped.names)} of {count} photos")
         if best is None or len(mapped.names) > len(best.names):
             best = mapped
-        if len(best.names) >= SATISFIED * count:
+        if len(best.names) >= ENOUGH_PLACED * count:
             break
     if best is None:
         return None
@@ -87,7 +87,7 @@ def find_poses(
 
 
 def mappers_to_try(config: SfmConfig, count: int) -> list[str]:
-    """What `auto` becomes: a first choice, and another for when that leaves many photos out."""
+    """Mappers in order: `auto` is a first choice, and another in case that leaves many photos out."""
     if config.mapper != "auto":
         return [config.mapper]
     return ["incremental", "hybrid"] if count <= INCREMENTAL_UP_TO else ["hybrid", "incremental"]
@@ -113,16 +113,16 @@ def run_mapper(
 
 
 def adjusted(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> Any:
-    """After bundle adjustment over everything; where many photos share a camera, its principal point may move."""
-    if reconstruction.num_reg_images() >= ENOUGH_FOR_CENTER * len(reconstruction.cameras):
+    """The reconstruction after bundle adjustment; the principal point of a camera of many photos may move."""
+    if reconstruction.num_reg_images() >= CENTER_FROM * len(reconstruction.cameras):
         moved = _bundle_adjusted(pycolmap, reconstruction, config, center=True)
-        if all(off_center(camera) <= MOST_OFF_CENTER for camera in moved.cameras.values()):
+        if all(off_center(camera) <= MAX_OFF_CENTER for camera in moved.cameras.values()):
             return moved
     return _bundle_adjusted(pycolmap, reconstruction, config, center=False)
 
 
 def off_center(camera: Any) -> float:
-    """How far the principal point lies from the middle of the photo, as a share of its width or height."""
+    """Distance of the principal point from the middle of the photo, as a share of its width or height."""
     x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
     return float(max(abs(x - 0.5), abs(y - 0.5)))
 
@@ -157,7 +157,7 @@ def keep_coherent(reconstruction: Any) -> None:
 
 
 def covisible_groups(reconstruction: Any) -> list[set[int]]:
-    """Registered photos connected by pairs that share at least FEWEST_POINTS points; those that see fewer are left out.
+    """Registered photos connected by pairs that share at least MIN_SHARED_POINTS points; others are left out.
 
     Pairs are counted along each point's track, which reaches every photo that sees the point.
     """
@@ -167,7 +167,7 @@ def covisible_groups(reconstruction: Any) -> list[set[int]]:
         shared.update(itertools.combinations(seen_by, 2))
     group: dict[int, set[int]] = {}
     for (a, b), count in shared.items():
-        if count >= FEWEST_POINTS and group.setdefault(a, {a}) is not group.setdefault(b, {b}):
+        if count >= MIN_SHARED_POINTS and group.setdefault(a, {a}) is not group.setdefault(b, {b}):
             merged = group[a] | group[b]
             group.update(dict.fromkeys(merged, merged))
     return list({id(members): members for members in group.values()}.values())
@@ -214,7 +214,7 @@ def _global(
 def _calibrate_by_seed(
     pycolmap: ModuleType, database: Path, photos: Path, target: Path, graph: ViewGraph, config: SfmConfig
 ) -> None:
-    """Put the lenses into the database that a small incremental reconstruction finds, where EXIF told none.
+    """Put the lenses into the database that a small incremental reconstruction finds, for photos without EXIF.
 
     Fundamental matrices alone do not fix the focal length of cameras that look at one point (Sturm 2001), which is how
     objects are photographed: on such photos the guess of 1.2 image widths stayed 70 % too long, and global mapping fell

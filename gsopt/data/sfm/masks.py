@@ -1,4 +1,4 @@
-"""What features may be taken from: masks of a folder, or the photos' own alpha."""
+"""Masks for feature extraction: those of a folder, or the photos' own alpha."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from gsopt.data.masks import find_mask
 from gsopt.data.sfm.photos import Photo
 from gsopt.errors import InputError
 
-BEHIND = (128, 128, 128)
-"""Under transparent pixels: what a file keeps there is arbitrary and would give features."""
+OPAQUE_BACKGROUND = (128, 128, 128)
+"""Replaces the colors of transparent pixels, which are arbitrary and would give features."""
 
 
 @dataclass(frozen=True)
-class Masked:
-    """Where feature extraction finds its pictures."""
+class FeatureInput:
+    """Photos and masks for feature extraction."""
 
     photos: Path
     """Folder of opaque photos."""
     masks: Path | None
-    """Folder of NAME.png, white where features may be; None when every pixel counts."""
+    """Folder of NAME.png, white for features; absent if every pixel counts."""
     kind: str
-    """folder, alpha or none: what `auto` became."""
+    """folder, alpha or none, with `auto` resolved."""
     unmasked: list[str]
     """Photos for which the folder holds no mask."""
 
 
-def prepare_masks(choice: str, source: Path, photos: list[Photo], work: Path) -> Masked:
+def prepare_masks(choice: str, source: Path, photos: list[Photo], work: Path) -> FeatureInput:
     """Write the masks and opaque copies that `--masks` asks for into `work`. InputError where none fits."""
     folder = source / "masks" if choice == "auto" else Path(choice).expanduser()
     has_alpha = any(photo.has_alpha for photo in photos)
@@ -44,7 +44,7 @@ def prepare_masks(choice: str, source: Path, photos: list[Photo], work: Path) ->
     else:
         raise InputError(f"`--masks` names no folder: got {choice}. Give a folder of masks, alpha or none.")
     opaque = _opaque(photos, work / "opaque") if has_alpha else work / "photos"
-    return Masked(opaque, None if kind == "none" else work / "masks", kind, unmasked)
+    return FeatureInput(opaque, None if kind == "none" else work / "masks", kind, unmasked)
 
 
 def _from_folder(folder: Path, photos: list[Photo], target: Path) -> list[str]:
@@ -82,7 +82,7 @@ def _from_alpha(photos: list[Photo], target: Path) -> list[str]:
 
 
 def _opaque(photos: list[Photo], target: Path) -> Path:
-    """Copies without alpha, on grey."""
+    """Copies without alpha, on gray."""
     target.mkdir()
     for photo in photos:
         if not photo.has_alpha:
@@ -90,6 +90,6 @@ def _opaque(photos: list[Photo], target: Path) -> Path:
             continue
         with Image.open(photo.path) as image:
             layered = image.convert("RGBA")
-            behind = Image.new("RGBA", layered.size, (*BEHIND, 255))
+            behind = Image.new("RGBA", layered.size, (*OPAQUE_BACKGROUND, 255))
             Image.alpha_composite(behind, layered).convert("RGB").save(target / photo.name, compress_level=1)
     return target

@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-PANEL = 720
-OVERSAMPLED = 2
+PANEL_SIDE = 720
+OVERSAMPLING = 2
 MARGIN = 0.06
 CAMERA_SIZE = 0.045
 """Length of a drawn camera, share of the panel."""
 CAMERA_AREA = 1.6
 """The panel shows the cameras' box times this."""
-PAPER, GRID, INK, PATH = (250, 249, 246), (228, 226, 220), (60, 58, 54), (200, 196, 188)
-CAMERA = (196, 78, 36)
-MOST_POINTS = 40_000
+PAPER_COLOR, FRAME_COLOR, INK_COLOR, PATH_COLOR = (250, 249, 246), (228, 226, 220), (60, 58, 54), (200, 196, 188)
+CAMERA_COLOR = (196, 78, 36)
+MAX_POINTS = 40_000
 _VIEWS = (("from above", (0, 1)), ("from the side", (0, 2)))
 
 
@@ -32,18 +32,18 @@ def draw_scene(
     """PNG of a placed scene (z up). Cameras are orange triangles that open where they look."""
     world_from_cam = np.linalg.inv(viewmats)
     centers, axes = world_from_cam[:, :3, 3], world_from_cam[:, :3, :3]
-    side = PANEL * OVERSAMPLED
-    sheet = Image.new("RGB", (len(_VIEWS) * side, side + 48 * OVERSAMPLED), PAPER)
-    step = max(1, len(points) // MOST_POINTS)
+    side = PANEL_SIDE * OVERSAMPLING
+    sheet = Image.new("RGB", (len(_VIEWS) * side, side + 48 * OVERSAMPLING), PAPER_COLOR)
+    step = max(1, len(points) // MAX_POINTS)
     for column, (title, plane) in enumerate(_VIEWS):
         panel = _panel(side, plane, centers, axes, points[::step], colors[::step])
         _label(panel, title)
         _number(panel, plane, centers, points, names, side)
         sheet.paste(panel, (column * side, 0))
     draw = ImageDraw.Draw(sheet)
-    draw.text((side * MARGIN, side + 8 * OVERSAMPLED), headline, INK, font=_font(17))
+    draw.text((side * MARGIN, side + 8 * OVERSAMPLING), headline, INK_COLOR, font=_font(17))
     buffer = io.BytesIO()
-    sheet.resize((sheet.width // OVERSAMPLED, sheet.height // OVERSAMPLED), Image.Resampling.LANCZOS).save(
+    sheet.resize((sheet.width // OVERSAMPLING, sheet.height // OVERSAMPLING), Image.Resampling.LANCZOS).save(
         buffer, format="PNG", optimize=True
     )
     return buffer.getvalue()
@@ -59,25 +59,25 @@ def _panel(
 ) -> Image.Image:
     """Points as pixels in their own colors, nearer ones over farther ones, then the cameras in order."""
     middle, half = _window(centers, points)
-    pixels = np.full((side, side, 3), PAPER, dtype=np.uint8)
+    pixels = np.full((side, side, 3), PAPER_COLOR, dtype=np.uint8)
     depth_axis = 3 - plane[0] - plane[1]
     order = np.argsort(points[:, depth_axis] * (1 if depth_axis == 2 else -1))
     columns, rows = _to_pixels(points[order], plane, middle, half, side).round().astype(int).T
     colors = colors[order]
-    for dy in range(OVERSAMPLED + 1):
-        for dx in range(OVERSAMPLED + 1):
+    for dy in range(OVERSAMPLING + 1):
+        for dx in range(OVERSAMPLING + 1):
             inside = (columns + dx >= 0) & (columns + dx < side) & (rows + dy >= 0) & (rows + dy < side)
             pixels[rows[inside] + dy, columns[inside] + dx] = colors[inside]
     panel = Image.fromarray(pixels)
     draw = ImageDraw.Draw(panel)
     path = [(float(x), float(y)) for x, y in _to_pixels(centers, plane, middle, half, side)]
     if len(path) > 1:
-        draw.line(path, fill=PATH, width=OVERSAMPLED)
+        draw.line(path, fill=PATH_COLOR, width=OVERSAMPLING)
     length = CAMERA_SIZE * 2 * half
     for center, axis in zip(centers, axes, strict=True):
         corners = center + length * np.stack([axis[:, 2] + 0.5 * axis[:, 0], axis[:, 2] - 0.5 * axis[:, 0]])
         shape = _to_pixels(np.vstack([center, corners]), plane, middle, half, side)
-        draw.polygon([(float(x), float(y)) for x, y in shape], outline=CAMERA, width=OVERSAMPLED + 1)
+        draw.polygon([(float(x), float(y)) for x, y in shape], outline=CAMERA_COLOR, width=OVERSAMPLING + 1)
     return panel
 
 
@@ -115,14 +115,14 @@ def _number(
     chosen: Int[np.ndarray, "K"] = np.unique(np.linspace(0, len(names) - 1, min(6, len(names))).round().astype(int))
     for i in chosen:
         x, y = _to_pixels(centers[i : i + 1], plane, middle, half, side)[0]
-        draw.text((x + 6 * OVERSAMPLED, y - 8 * OVERSAMPLED), names[i], INK, font=_font(13))
+        draw.text((x + 6 * OVERSAMPLING, y - 8 * OVERSAMPLING), names[i], INK_COLOR, font=_font(13))
 
 
 def _label(panel: Image.Image, title: str) -> None:
     draw = ImageDraw.Draw(panel)
-    draw.rectangle((0, 0, panel.width - 1, panel.height - 1), outline=GRID, width=OVERSAMPLED)
-    draw.text((panel.width * MARGIN, panel.height * MARGIN / 2), title, INK, font=_font(17))
+    draw.rectangle((0, 0, panel.width - 1, panel.height - 1), outline=FRAME_COLOR, width=OVERSAMPLING)
+    draw.text((panel.width * MARGIN, panel.height * MARGIN / 2), title, INK_COLOR, font=_font(17))
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size * OVERSAMPLED)
+    return ImageFont.load_default(size * OVERSAMPLING)

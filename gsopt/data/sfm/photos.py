@@ -1,4 +1,4 @@
-"""Photos as strangers take them: decoded, turned upright, measured; what cannot be used is named with its reason."""
+"""Input photos: decoded, turned upright and measured, or rejected with a reason."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from gsopt.errors import InputError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif")
 HEIC = (".heic", ".heif")
-SMALLEST_SIDE = 160
-"""Shorter photos hold too few features to be placed."""
+MIN_PHOTO_SIDE = 160
+"""Smaller photos hold too few features to be placed, px."""
 COPY_RMS = 1.0
-"""Thumbnails whose grey levels (0..255) differ by less are the same picture."""
-THUMBNAIL = 32
-JUDGED_SIDE = 640
-"""Sharpness is judged at this size, so that photos of different sizes compare."""
+"""Thumbnails whose gray levels (0..255) differ by less show the same photo."""
+THUMBNAIL_SIDE = 32
+SHARPNESS_SIDE = 640
+"""Sharpness is measured at this size, so that photos of different sizes compare."""
 _DIAGONAL_35MM = math.hypot(36, 24)
 _LOSSLESS = ("PNG", "BMP", "TIFF")
 
@@ -42,7 +42,7 @@ class Photo:
     path: Path
     width: int
     height: int
-    """Of the upright photo."""
+    """Size of the upright photo."""
     camera: str
     """Photos with the same text were taken by the same lens at the same zoom and size."""
     focal: float | None
@@ -50,7 +50,7 @@ class Photo:
     sharpness: float
     has_alpha: bool
     thumbnail: Float32[np.ndarray, "32 32"]
-    """Grey levels, 0..255."""
+    """Gray levels, 0..255."""
 
     @property
     def contrast(self) -> float:
@@ -59,7 +59,7 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RejectedFile:
     """A file that was left out before anything was computed."""
 
     name: str
@@ -82,30 +82,30 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", name)]
 
 
-def read_photos(paths: list[Path], work: Path) -> tuple[list[Photo], list[Refused]]:
+def read_photos(paths: list[Path], work: Path) -> tuple[list[Photo], list[RejectedFile]]:
     """Upright photos in WORK/photos, copies of an earlier one left out, and what was refused."""
     folder = work / "photos"
     folder.mkdir(parents=True)
     photos: list[Photo] = []
-    refused: list[Refused] = []
+    refused: list[RejectedFile] = []
     taken: set[str] = set()
     for path in paths:
         try:
             photo = read_photo(path, folder, taken)
         except InputError as error:
-            refused.append(Refused(path.name, str(error)))
+            refused.append(RejectedFile(path.name, str(error)))
             continue
         twin = next((other for other in photos if is_copy(photo, other)), None)
         if twin is None:
             photos.append(photo)
         else:
-            refused.append(Refused(path.name, f"a copy of {twin.name}: it adds nothing"))
+            refused.append(RejectedFile(path.name, f"a copy of {twin.name}: it adds nothing"))
             photo.path.unlink()
     return photos, refused
 
 
 def read_photo(path: Path, folder: Path, taken: set[str]) -> Photo:
-    """Decode one photo, turn it upright and put it into `folder`. InputError that says why it cannot be used."""
+    """Decode one photo, turn it upright and put it into `folder`. InputError with the reason if it cannot be used."""
     image = _opened(path)
     try:
         exif = image.getexif()
@@ -115,7 +115,7 @@ def read_photo(path: Path, folder: Path, taken: set[str]) -> Photo:
         upright = ImageOps.exif_transpose(image) if turned else image
     except Exception as error:  # decoders raise nearly anything on a hostile file
         raise InputError(f"cannot be decoded ({_short(error)}). Copy it again from the camera") from error
-    if min(upright.size) < SMALLEST_SIDE:
+    if min(upright.size) < MIN_PHOTO_SIDE:
         raise InputError(f"too small: {upright.width}x{upright.height} px. Take the original, not a preview")
     has_alpha = "A" in upright.getbands() or "transparency" in upright.info
     name = _scene_name(path, kind, has_alpha, taken)
@@ -138,12 +138,12 @@ def read_photo(path: Path, folder: Path, taken: set[str]) -> Photo:
         focal=focal,
         sharpness=sharpness(gray),
         has_alpha=has_alpha,
-        thumbnail=np.asarray(gray.resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX), dtype=np.float32),
+        thumbnail=np.asarray(gray.resize((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.BOX), dtype=np.float32),
     )
 
 
 def focal_from_exif(exif: Image.Exif, size: tuple[int, int]) -> float | None:
-    """Focal length in pixels from the 35 mm equivalent, which is defined by the diagonal (CIPA DCG-001); None without.
+    """Focal length in pixels from the 35 mm equivalent, which is defined by the diagonal (CIPA DCG-001), or None.
 
     The diagonal is the same for a photo that is turned.
     """
@@ -158,11 +158,11 @@ def focal_from_exif(exif: Image.Exif, size: tuple[int, int]) -> float | None:
 
 
 def sharpness(gray: Image.Image) -> float:
-    """Variance of the Laplacian relative to the variance of the picture: 0 for fog, about 1 for fine detail.
+    """Variance of the Laplacian relative to the variance of the photo: 0 for fog, about 1 for fine detail.
 
     The relative measure (after Pech-Pacheco et al. 2000) does not fall when a scene is dim or of low contrast.
     """
-    scale = JUDGED_SIDE / max(gray.size)
+    scale = SHARPNESS_SIDE / max(gray.size)
     if scale < 1:
         size = (max(3, round(gray.width * scale)), max(3, round(gray.height * scale)))
         gray = gray.resize(size, Image.Resampling.BOX)
@@ -172,7 +172,7 @@ def sharpness(gray: Image.Image) -> float:
 
 
 def is_copy(photo: Photo, other: Photo) -> bool:
-    """Whether two files show the same picture, re-encoded or not."""
+    """True when two files show the same photo, re-encoded or not."""
     if photo.width * other.height != photo.height * other.width:
         return False
     return float(np.sqrt(np.square(photo.thumbnail - other.thumbnail).mean())) < COPY_RMS
@@ -213,7 +213,7 @@ def _reads_heic() -> bool:
 
 
 def _scene_name(path: Path, kind: str, has_alpha: bool, taken: set[str]) -> str:
-    """A name without blanks (COLMAP's lists are split at them) that no earlier photo has; then it is taken."""
+    """A name without blanks (COLMAP's lists are split at them) that no earlier photo has; adds it to `taken`."""
     stem = re.sub(r"[^\w.+-]", "_", path.stem) or "photo"
     suffix = ".png" if has_alpha or kind in _LOSSLESS else ".jpg"
     name, n = stem + suffix, 2

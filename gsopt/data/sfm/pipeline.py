@@ -1,4 +1,4 @@
-"""`pose_photos`: from a folder of photos or a video to a posed scene folder, or to a report that says why not.
+"""`pose_photos`: from a folder of photos or a video to a posed scene folder, or to a report of the reasons.
 
 photos ─► features ─► pairs and matches ─► mapping ─► placement ─► undistorted scene + sfm.json + sfm.png
 Nothing is left behind but the finished folder: all work happens under a hidden name beside it.
@@ -26,9 +26,10 @@ from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, features, known_poses, mapping
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import ViewGraph
-from gsopt.data.sfm.masks import Masked, prepare_masks
+from gsopt.data.sfm.mapping import MappingResult
+from gsopt.data.sfm.masks import FeatureInput, prepare_masks
 from gsopt.data.sfm.overview_image import draw_scene
-from gsopt.data.sfm.photos import Photo, Refused, find_photos, natural, read_photos
+from gsopt.data.sfm.photos import Photo, RejectedFile, find_photos, natural, read_photos
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
@@ -37,12 +38,12 @@ from gsopt.data.sfm.write_scene import write_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
 
-RECORD, PICTURE = "sfm.json", "sfm.png"
-VERSION = 1
+RECORD, OVERVIEW = "sfm.json", "sfm.png"
+RECORD_VERSION = 1
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedScene:
     """A scene that was written."""
 
     path: Path
@@ -51,7 +52,7 @@ class Posed:
     """Wall time by stage."""
 
 
-def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lambda line: None) -> Posed:
+def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lambda line: None) -> PosedScene:
     """Find the poses of the photos in `source` (or of the frames of a video) and write the scene folder `out`.
 
     Raises InputError with the whole report when fewer than three photos can be placed, UsageError when `out` exists,
@@ -63,14 +64,14 @@ def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lam
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
     pycolmap = require("pycolmap", "sfm", "Finding camera poses")
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # what matters is said by the diagnosis
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # the diagnosis reports what matters
     with _working_folder(out) as work:
         run = _Run(pycolmap, source, work, config, report)
         scene, found = run.posed()
         if out.is_dir():
             out.rmdir()
         os.replace(scene, out)
-    return Posed(out, found, run.seconds)
+    return PosedScene(out, found, run.seconds)
 
 
 class _Run:
@@ -82,24 +83,24 @@ class _Run:
         self.seconds: dict[str, float] = {}
 
     def posed(self) -> tuple[Path, Diagnosis]:
-        """The finished scene folder inside the working folder, and what there is to say about it."""
+        """The finished scene folder inside the working folder, and its diagnosis."""
         with self._timed("photos"):
             photos, refused = self._photos()
             frames = self._prior_frames(photos)
             if len(photos) == 1 or (not photos and refused):
                 raise too_few(diagnosis.explain(photos, refused, None, set()), None)
-            masked = prepare_masks(self.config.masks, self.source, photos, self.work)
-        graph, matching = self._graph(photos, masked, frames)
+            inputs = prepare_masks(self.config.masks, self.source, photos, self.work)
+        graph, matching = self._graph(photos, inputs, frames)
         with self._timed("mapping"):
-            mapped = self._mapped(masked, graph, frames)
+            mapped = self._mapped(inputs, graph, frames)
         if mapped is None:
             raise too_few(diagnosis.explain(photos, refused, graph, set()), graph)
         report = self._diagnose(photos, refused, graph, mapped)
         with self._timed("writing"):
-            scene = self._write(report, mapped, masked, matching, similarity=self._placed(mapped, frames))
+            scene = self._write(report, mapped, inputs, matching, similarity=self._placed(mapped, frames))
         return scene, report
 
-    def _photos(self) -> tuple[list[Photo], list[Refused]]:
+    def _photos(self) -> tuple[list[Photo], list[RejectedFile]]:
         if not is_video(self.source):
             paths = find_photos(self.source)
         else:
@@ -114,8 +115,8 @@ class _Run:
         """The known poses of these photos (`--poses prior`)."""
         if self.config.poses != "prior":
             return None
-        source = read_dataset(self.source)
-        frames = [*source.frames, *(source.held_out or [])]
+        dataset = read_dataset(self.source)
+        frames = [*dataset.frames, *(dataset.held_out or [])]
         known = {frame.path.name: frame for frame in frames}
         unknown = [photo.name for photo in photos if photo.source.name not in known]
         if unknown:
@@ -128,28 +129,30 @@ class _Run:
             photos[i] = replace(photo, camera=known_poses.camera_key(frame))
         return [replace(known[photo.source.name], name=photo.name) for photo in photos]
 
-    def _graph(self, photos: list[Photo], masked: Masked, frames: list[PosedImage] | None) -> tuple[ViewGraph, str]:
+    def _graph(
+        self, photos: list[Photo], inputs: FeatureInput, frames: list[PosedImage] | None
+    ) -> tuple[ViewGraph, str]:
         names = [photo.name for photo in photos]
         matching = features.choose_matching(self.config, len(names), is_video(self.source))
         with self._timed("features"):
-            self.report(f"looking for features in {len(names)} photos (masks: {masked.kind})")
-            features.extract(self.pycolmap, self.database, photos, masked, self.config)
+            self.report(f"looking for features in {len(names)} photos (masks: {inputs.kind})")
+            features.extract(self.pycolmap, self.database, photos, inputs, self.config)
             if frames is not None:
                 known_poses.write_cameras(self.pycolmap, self.database, frames)
         with self._timed("matching"):
             graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.report)
         return graph, matching
 
-    def _mapped(self, masked: Masked, graph: ViewGraph, frames: list[PosedImage] | None) -> mapping.Mapped | None:
+    def _mapped(self, inputs: FeatureInput, graph: ViewGraph, frames: list[PosedImage] | None) -> MappingResult | None:
         if len(graph.features) < mapping.SMALLEST_MODEL:
             return None
         if frames is None:
-            return mapping.find_poses(self.pycolmap, self.database, masked.photos, graph, self.config, self.report)
-        found = known_poses.triangulate(self.pycolmap, self.database, masked.photos, frames, self.config)
-        return mapping.Mapped(found, "poses as given", [])
+            return mapping.find_poses(self.pycolmap, self.database, inputs.photos, graph, self.config, self.report)
+        found = known_poses.triangulate(self.pycolmap, self.database, inputs.photos, frames, self.config)
+        return MappingResult(found, "poses as given", [])
 
     def _diagnose(
-        self, photos: list[Photo], refused: list[Refused], graph: ViewGraph, mapped: mapping.Mapped
+        self, photos: list[Photo], refused: list[RejectedFile], graph: ViewGraph, mapped: MappingResult
     ) -> Diagnosis:
         report = diagnosis.explain(photos, refused, graph, mapped.names)
         report.mapper = mapped.mapper
@@ -161,28 +164,28 @@ class _Run:
         report.advice += diagnosis.wide_gaps(names, viewmats)
         return report
 
-    def _placed(self, mapped: mapping.Mapped, frames: list[PosedImage] | None) -> Similarity:
+    def _placed(self, mapped: MappingResult, frames: list[PosedImage] | None) -> Similarity:
         """Known poses stay where they are; found ones get axes, origin and scale."""
         if frames is not None:
             return Similarity.identity()
         return place(poses(mapped.reconstruction)[1], points(mapped.reconstruction)[0])
 
     def _write(
-        self, report: Diagnosis, mapped: mapping.Mapped, masked: Masked, matching: str, similarity: Similarity
+        self, report: Diagnosis, mapped: MappingResult, inputs: FeatureInput, matching: str, similarity: Similarity
     ) -> Path:
-        scene = write_scene(self.pycolmap, mapped.reconstruction, self.work, masked, similarity, self.config.undistort)
+        scene = write_scene(self.pycolmap, mapped.reconstruction, self.work, inputs, similarity, self.config.undistort)
         names, viewmats = poses(mapped.reconstruction)
         xyz, rgb = points(mapped.reconstruction)
-        write_atomic(scene / PICTURE, draw_scene(viewmats, names, xyz, rgb, report.headline()))
+        write_atomic(scene / OVERVIEW, draw_scene(viewmats, names, xyz, rgb, report.headline()))
         record = {
-            "version": VERSION,
+            "version": RECORD_VERSION,
             "gsopt": __version__,
             "pycolmap": self.pycolmap.__version__,
             "source": str(self.source),
             "fingerprint": fingerprint(self.source),
             "settings": asdict(self.config),
             "matching": matching,
-            "masks": masked.kind,
+            "masks": inputs.kind,
             "report": report.lines(),
             **asdict(report),
             "placed_from_found": {
@@ -219,7 +222,7 @@ def points(reconstruction: Any) -> tuple[Float[np.ndarray, "P 3"], Any]:
 
 
 def fingerprint(source: Path) -> list[list[Any]]:
-    """Name, size and time of each input file: tells whether a scene was made from what is there now."""
+    """Name, size and time of each input file: a scene with another fingerprint is out of date."""
     paths = [source] if is_video(source) else find_photos(source)
     return [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
 

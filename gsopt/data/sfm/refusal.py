@@ -1,4 +1,4 @@
-"""What is said when no scene can be made: the reasons, and what can be done with what there is."""
+"""The error for photos that give no scene: the reasons, and what the user can do."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Which photos look alike, without a vocabulary to download: the photos' own features make it.
+"""Retrieval of similar photos. The vocabulary is made from the photos' own features: none has to be downloaded.
 
 Each photo becomes one vector, the residuals of its features from the nearest of 64 words (VLAD, Jégou et al. 2010,
-with the normalisation of Arandjelović and Zisserman 2013); the words are k-means centers of the photos' own features.
+with the normalization of Arandjelović and Zisserman 2013); the words are k-means centers of the photos' own features.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
 WORDS = 64
-SAMPLE = 20_000
+WORD_FEATURES = 20_000
 """Features the words are made from."""
-PER_PHOTO = 1024
-ITERATIONS = 10
+PHOTO_FEATURES = 1024
+"""Features of each photo that count."""
+KMEANS_STEPS = 10
 
 
 def similar_pairs(descriptors: Sequence[UInt8[np.ndarray, "F 128"]], most: int, seed: int) -> set[tuple[int, int]]:
     """Rows (i, j), i < j, where one is among the `most` photos that look most like the other. Seeded."""
     generator = np.random.default_rng(seed)
-    chosen = [_rooted(_sampled(rows, PER_PHOTO, generator)) for rows in descriptors]
-    words = _words(_sampled(np.concatenate(chosen), SAMPLE, generator), generator)
+    chosen = [_rooted(_sampled(rows, PHOTO_FEATURES, generator)) for rows in descriptors]
+    words = _words(_sampled(np.concatenate(chosen), WORD_FEATURES, generator), generator)
     vectors = np.stack([vlad(rows, words) for rows in chosen])
     likeness = vectors @ vectors.T
     np.fill_diagonal(likeness, -np.inf)
@@ -44,7 +45,7 @@ def vlad(rows: Float32[np.ndarray, "F 128"], words: Float32[np.ndarray, "W 128"]
 def _words(rows: Float32[np.ndarray, "F 128"], generator: np.random.Generator) -> Float32[np.ndarray, "W 128"]:
     """k-means (Lloyd 1982); a word without features stays where it was."""
     words = _sampled(rows, WORDS, generator).copy()
-    for _ in range(ITERATIONS):
+    for _ in range(KMEANS_STEPS):
         nearest = _nearest(rows, words)
         for word in range(len(words)):
             members = rows[nearest == word]

@@ -1,4 +1,4 @@
-"""Poses for `gsopt train PHOTOS`: none to find where there are some, and none to find twice."""
+"""Poses for `gsopt train PHOTOS`: found only if there are none, and never twice for the same photos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsopt.events import Report
 
 
 def needs_poses(data: Path) -> bool:
-    """True for a video or a folder of photos without poses; False for anything that `load_scene` should judge."""
+    """True for a video or a folder of photos without poses; False for anything that `load_scene` reads or refuses."""
     if is_video(data):
         return data.is_file()
     if not data.is_dir() or is_posed(data):
@@ -44,7 +44,7 @@ def posed_scene(data: Path, folder: Path, config: SfmConfig, report: Report) -> 
 
 
 def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
-    """Whether the scene was made from these very files, with the same seed."""
+    """True when the scene was made from these very files, with the same seed."""
     record = scene / RECORD
     if not files.is_regular(record) or not is_posed(scene):
         return False

@@ -1,4 +1,4 @@
-"""What `gsopt sfm` can be told. Standard library only: the command line's help reads this."""
+"""Settings of `gsopt sfm`. Standard library only: the command line's help reads this."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 CameraModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Poses = Literal["find", "prior"]
 
-LARGEST_SIDE = 20_000
-MOST_FEATURES = 65_536
+MAX_SIDE = 20_000
+MAX_FEATURES = 65_536
 
 
 @dataclass(frozen=True)
 class SfmConfig:
-    """How photos become a posed scene. The same photos, settings and seed give the same poses."""
+    """Settings of structure from motion. The same photos, settings and seed give the same poses."""
 
     mapper: Mapper = "auto"
     """incremental adds photo by photo; global places all at once; hybrid is global, then incremental for what was
     left out; auto takes incremental up to 300 photos and hybrid beyond, and tries the other when many are left out."""
     matching: Matching = "auto"
-    """Which photos are compared: all with all (exhaustive), neighbors in time and loops (sequential), look-alikes
+    """Pairs of photos to compare: all with all (exhaustive), neighbors in time and loops (sequential), look-alikes
     (retrieval); auto takes exhaustive up to 200 photos, sequential for a video, retrieval otherwise."""
     poses: Poses = "find"
     """prior keeps the poses and lenses that the input folder already has and adds points to them."""
@@ -52,8 +52,8 @@ class SfmConfig:
         check.one_of("--mapper", self.mapper, ("auto", "incremental", "global", "hybrid"))
         check.one_of("--matching", self.matching, ("auto", "exhaustive", "sequential", "retrieval"))
         check.one_of("--poses", self.poses, ("find", "prior"))
-        check.within("--max-size", self.max_size, 64, LARGEST_SIDE, "The default is 1600.")
-        check.within("--features", self.features, 64, MOST_FEATURES, "The default is 4096.")
+        check.within("--max-size", self.max_size, 64, MAX_SIDE, "The default is 1600.")
+        check.within("--features", self.features, 64, MAX_FEATURES, "The default is 4096.")
         check.within("--frames", self.frames, 3, 100_000, "The default is 150.")
         check.within("--seed", self.seed, 0, 2**31 - 1, "Give a whole number in that range.")
         check.at_least("--threads", self.threads, 0, "0 takes one thread per core.")

@@ -1,4 +1,4 @@
-"""How far apart two sets of poses of the same photos are, once position, orientation and scale are made to agree."""
+"""Distance between two sets of poses of the same photos, after the best similarity between them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsopt.data.sfm.placement import Similarity
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Of C cameras after the best similarity."""
+    """Errors of C cameras after the best similarity."""
 
     rotation_degrees: Float[np.ndarray, "C"]
     position: Float[np.ndarray, "C"]

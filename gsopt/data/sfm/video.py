@@ -1,7 +1,7 @@
-"""Frames of a video that are worth keeping: apart from each other, and the sharpest of their surroundings.
+"""Selection of a video's frames: apart from each other, and the sharpest of their neighborhood.
 
 Two passes: the first measures every frame in small, the second writes the chosen ones. Motion is the shift of a grid
-of tiles (phase correlation, Kuglin and Hines 1975) against an anchor frame, which is replaced once the picture has
+of tiles (phase correlation, Kuglin and Hines 1975) against an anchor frame, which is replaced once the image has
 moved visibly: a slow path adds up, a trembling hand does not.
 """
 
@@ -23,23 +23,23 @@ from gsopt.data.sfm.photos import sharpness
 from gsopt.errors import InputError
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".3gp", ".gif")
-SMALL_SIDE = 256
+MEASURED_SIDE = 256
 """Longer side at which frames are measured, px."""
-TILES = 4
-LEAST_MOTION, MOST_MOTION = 0.02, 0.08
+TILES_PER_SIDE = 4
+MIN_MOTION, MAX_MOTION = 0.02, 0.08
 """Between two kept frames, share of the longer side: below, near-duplicates; above, too little overlap."""
-LEAST_STEP = 0.008
-"""A shorter way from the anchor frame is trembling, share of the longer side (2 px at SMALL_SIDE)."""
+MIN_STEP = 0.008
+"""A shorter way from the anchor frame is trembling, share of the longer side (2 px at MEASURED_SIDE)."""
 CENTRAL_SHARE = 0.6
 """Middle part of a stretch of motion in which its sharpest frame is looked for: keeps neighbors apart."""
-LOST_PEAK = 6.0
+MIN_PEAK = 6.0
 """A correlation peak below this, over the root of a tile's pixels, means that two frames have nothing in common: a cut,
 or a jump. Noise peaks at 4.5 to 5, pictures of one thing that moved a little at 6 and far above."""
-_WRITTEN_QUALITY = 95
+_JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Measured:
+class FrameMeasurement:
     """One frame of the first pass."""
 
     index: int
@@ -50,21 +50,21 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """What was taken from a video."""
+class FrameSelection:
+    """The frames selected from a video."""
 
     paths: list[Path]
     decoded: int
     seconds: float
     motion: float
-    """Whole way, in longer sides of the picture."""
+    """Length of the whole path, in longer sides of the image."""
 
 
 def is_video(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def extract_frames(video: Path, folder: Path, most: int) -> Chosen:
+def extract_frames(video: Path, folder: Path, most: int) -> FrameSelection:
     """Write at most `most` well-chosen frames to `folder` as NAME_00001.jpg, numbered as in the video.
 
     Raises InputError for a file that is empty, broken or no video, MissingDependency without PyAV.
@@ -79,12 +79,12 @@ def extract_frames(video: Path, folder: Path, most: int) -> Chosen:
     wanted = set(choose(measured, most))
     folder.mkdir(parents=True)
     paths = [_write(image, folder, index) for index, image in _upright(av, video) if index in wanted]
-    return Chosen(paths, len(measured), measured[-1].seconds, measured[-1].motion)
+    return FrameSelection(paths, len(measured), measured[-1].seconds, measured[-1].motion)
 
 
-def measure(frames: Iterator[tuple[int, float, Image.Image]]) -> list[Measured]:
-    """Sharpness and motion of (index, seconds, grey picture)."""
-    measured: list[Measured] = []
+def measure(frames: Iterator[tuple[int, float, Image.Image]]) -> list[FrameMeasurement]:
+    """Sharpness and motion of (index, seconds, gray image)."""
+    measured: list[FrameMeasurement] = []
     anchor: Float32[np.ndarray, "h w"] | None = None
     way = 0.0
     for index, seconds, gray in frames:
@@ -92,34 +92,34 @@ def measure(frames: Iterator[tuple[int, float, Image.Image]]) -> list[Measured]:
         if anchor is None or anchor.shape != picture.shape:
             anchor = picture
         step = motion_between(anchor, picture)
-        if step > LEAST_STEP:
+        if step > MIN_STEP:
             way, anchor = way + step, picture
-        measured.append(Measured(index, seconds, sharpness(gray), way))
+        measured.append(FrameMeasurement(index, seconds, sharpness(gray), way))
     return measured
 
 
-def choose(measured: list[Measured], most: int) -> list[int]:
+def choose(measured: list[FrameMeasurement], most: int) -> list[int]:
     """Indices of the frames to keep, in order: one for every equal stretch of the way."""
     way = measured[-1].motion
-    stretch = max(way / most, LEAST_MOTION)
-    stretch = min(stretch, MOST_MOTION) if way / MOST_MOTION <= most else stretch
-    stretches: dict[int, list[Measured]] = {}
+    stretch = max(way / most, MIN_MOTION)
+    stretch = min(stretch, MAX_MOTION) if way / MAX_MOTION <= most else stretch
+    stretches: dict[int, list[FrameMeasurement]] = {}
     for frame in measured:
         stretches.setdefault(int(frame.motion / stretch), []).append(frame)
     return [_sharpest(frames, stretch).index for _, frames in sorted(stretches.items())][:most]
 
 
 def motion_between(before: Float32[np.ndarray, "h w"], after: Float32[np.ndarray, "h w"]) -> float:
-    """Median shift of the tiles, share of the longer side; MOST_MOTION when the frames have nothing in common."""
+    """Median shift of the tiles, share of the longer side; MAX_MOTION when the frames have nothing in common."""
     if np.array_equal(before, after):
         return 0.0
-    height, width = (extent // TILES for extent in before.shape)
+    height, width = (extent // TILES_PER_SIDE for extent in before.shape)
     window = np.hanning(height)[:, None] * np.hanning(width)[None]
-    corners = [(row * height, column * width) for row in range(TILES) for column in range(TILES)]
+    corners = [(row * height, column * width) for row in range(TILES_PER_SIDE) for column in range(TILES_PER_SIDE)]
     tiles = [np.s_[top : top + height, left : left + width] for top, left in corners]
     shifts, peaks = zip(*(_correlate(before[tile], after[tile], window) for tile in tiles), strict=True)
-    if float(np.median(peaks)) < LOST_PEAK / np.sqrt(height * width):
-        return MOST_MOTION
+    if float(np.median(peaks)) < MIN_PEAK / np.sqrt(height * width):
+        return MAX_MOTION
     return float(np.median(np.linalg.norm(np.array(shifts), axis=1))) / max(before.shape)
 
 
@@ -134,7 +134,7 @@ def _correlate(before: Any, after: Any, window: Any) -> tuple[tuple[float, float
     return (float(row), float(column)), float(surface.max())
 
 
-def _sharpest(frames: list[Measured], stretch: float) -> Measured:
+def _sharpest(frames: list[FrameMeasurement], stretch: float) -> FrameMeasurement:
     middle = (int(frames[0].motion / stretch) + 0.5) * stretch
     central = [frame for frame in frames if abs(frame.motion - middle) <= CENTRAL_SHARE / 2 * stretch]
     return max(central or frames, key=lambda frame: frame.sharpness)
@@ -142,8 +142,11 @@ def _sharpest(frames: list[Measured], stretch: float) -> Measured:
 
 def _small_frames(av: ModuleType, video: Path) -> Iterator[tuple[int, float, Image.Image]]:
     for index, frame in _decoded(av, video):
-        scale = min(1.0, SMALL_SIDE / max(frame.width, frame.height))
-        size = (max(TILES * 4, round(frame.width * scale)), max(TILES * 4, round(frame.height * scale)))
+        scale = min(1.0, MEASURED_SIDE / max(frame.width, frame.height))
+        size = (
+            max(TILES_PER_SIDE * 4, round(frame.width * scale)),
+            max(TILES_PER_SIDE * 4, round(frame.height * scale)),
+        )
         gray = frame.reformat(width=size[0], height=size[1], format="gray")
         yield index, float(frame.time or 0.0), Image.fromarray(gray.to_ndarray())
 
@@ -176,5 +179,5 @@ def _decoded(av: ModuleType, video: Path) -> Iterator[tuple[int, Any]]:
 
 def _write(image: Image.Image, folder: Path, index: int) -> Path:
     path = folder / f"frame_{index + 1:05d}.jpg"
-    image.convert("RGB").save(path, quality=_WRITTEN_QUALITY, subsampling=0)
+    image.convert("RGB").save(path, quality=_JPEG_QUALITY, subsampling=0)
     return path

@@ -15,7 +15,7 @@ from gsopt.config.train import DataConfig
 from gsopt.data.colmap import read_colmap
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import View, load_scene
-from gsopt.data.sfm.masks import Masked
+from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.placement import Similarity
 from gsopt.events import to_json, write_atomic
 from gsopt.geometry.cameras import opengl_from_viewmats
@@ -25,14 +25,14 @@ JPEG_QUALITY = 97
 
 
 def write_scene(
-    pycolmap: ModuleType, reconstruction: Any, work: Path, masked: Masked, similarity: Similarity, undistort: bool
+    pycolmap: ModuleType, reconstruction: Any, work: Path, inputs: FeatureInput, similarity: Similarity, undistort: bool
 ) -> Path:
     """Write the scene to WORK/scene and return that folder. `reconstruction` is changed to what was written."""
     reconstruction.transform(pycolmap.Sim3d(similarity.scale, _rotation(pycolmap, similarity), similarity.translation))
     found, scene = work / "found", work / "scene"
     _model_folder(reconstruction, found)
     (found / "images").symlink_to(work / "photos")
-    if masked.kind == "folder":
+    if inputs.kind == "folder":
         (found / "masks").symlink_to(work / "masks")
     (scene / "images").mkdir(parents=True)
     if undistort:
@@ -46,7 +46,7 @@ def write_scene(
 
 
 def transforms(frames: Sequence[PosedImage], similarity: Similarity) -> dict[str, Any]:
-    """nerfstudio's transforms.json. `applied_transform` and `applied_scale` say how the world was placed."""
+    """nerfstudio's transforms.json. `applied_transform` and `applied_scale` record the placement of the world."""
     applied = np.column_stack([similarity.rotation, similarity.translation / similarity.scale])
     return {
         "applied_transform": applied.tolist(),

@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
 
 import textured_room as room
 
-from gsopt.data.sfm.pipeline import Posed, pose_photos
+from gsopt.data.sfm.pipeline import PosedScene, pose_photos
 from gsopt.data.sfm.settings import SfmConfig
 
 QUICK = SfmConfig(features=1200, threads=1)
@@ -24,5 +24,5 @@ def room_photos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def posed_room(room_photos: Path, tmp_path_factory) -> Posed:
+def posed_room(room_photos: Path, tmp_path_factory) -> PosedScene:
     return pose_photos(room_photos, tmp_path_factory.mktemp("scene") / "room", QUICK)

@@ -1,4 +1,4 @@
-"""What a person is told: reasons, advice, placement of the world, and figures of a trajectory."""
+"""Answers to the user: reasons, advice, placement of the world, and figures of a trajectory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gsopt.data.sfm import diagnosis
 from gsopt.data.sfm.features import ViewGraph, choose_matching, neighbors_in_time, reader_options
 from gsopt.data.sfm.mapping import mappers_to_try, off_center, seed_photos
-from gsopt.data.sfm.photos import Photo, Refused
+from gsopt.data.sfm.photos import Photo, RejectedFile
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.retrieval import similar_pairs
@@ -53,7 +53,7 @@ CHAIN = {(0, 1): 500, (1, 2): 400, (2, 3): 300}
 )
 def test_every_photo_without_a_pose_has_its_reason_and_a_remedy(left: Photo, found: ViewGraph, kind: str) -> None:
     photos = [photo(name) for name in NAMES[:4]] + [left]
-    report = diagnosis.explain(photos, [Refused("x.jpg", "is empty")], found, set(NAMES[:4]))
+    report = diagnosis.explain(photos, [RejectedFile("x.jpg", "is empty")], found, set(NAMES[:4]))
     assert [(item.name, item.kind) for item in report.left] == [("x.jpg", "refused"), ("4.jpg", kind)]
     assert report.given == 6
     assert diagnosis.REMEDIES[kind] in report.advice
@@ -75,7 +75,7 @@ def test_a_wide_turn_between_neighbors_is_pointed_out() -> None:
 
 
 def test_refusals_offer_the_object_path_only_where_it_can_help() -> None:
-    nothing = diagnosis.explain([], [Refused("x.jpg", "is empty")], None, set())
+    nothing = diagnosis.explain([], [RejectedFile("x.jpg", "is empty")], None, set())
     assert "None of the files can be used" in str(too_few(nothing, None))
     assert "--lambda-sds" not in str(too_few(nothing, None))
     one = diagnosis.explain([photo("0.jpg")], [], None, set())

@@ -17,7 +17,7 @@ from gsopt import cli
 from gsopt.data.colmap import read_colmap
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import load_scene
-from gsopt.data.sfm.pipeline import Posed, pose_photos
+from gsopt.data.sfm.pipeline import PosedScene, pose_photos
 from gsopt.data.sfm.reuse import needs_poses, posed_scene
 from gsopt.data.sfm.trajectory import compare
 from gsopt.data.transforms import read_transforms
@@ -36,13 +36,13 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
-def test_found_poses_are_the_true_ones(posed_room: Posed) -> None:
+def test_found_poses_are_the_true_ones(posed_room: PosedScene) -> None:
     error = compare(viewmats(read_colmap(posed_room.path).frames), room.arc(6).numpy())
     assert error.rotation_degrees.max() < ROTATION
     assert error.position.max() < POSITION
 
 
-def test_colmap_and_transforms_describe_the_same_cameras_and_points(posed_room: Posed) -> None:
+def test_colmap_and_transforms_describe_the_same_cameras_and_points(posed_room: PosedScene) -> None:
     ours, theirs = read_colmap(posed_room.path), read_transforms(posed_room.path)
     assert [frame.name for frame in ours.frames] == [frame.name for frame in theirs.frames]
     np.testing.assert_allclose(viewmats(ours.frames), viewmats(theirs.frames), atol=1e-12)
@@ -51,7 +51,7 @@ def test_colmap_and_transforms_describe_the_same_cameras_and_points(posed_room: 
     assert len(ours.xyz) == len(theirs.xyz) == posed_room.diagnosis.points
 
 
-def test_the_placement_can_be_taken_back(posed_room: Posed) -> None:
+def test_the_placement_can_be_taken_back(posed_room: PosedScene) -> None:
     placed = json.loads((posed_room.path / "sfm.json").read_text())["placed_from_found"]
     rotation = np.array(placed["rotation"])
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -61,7 +61,7 @@ def test_the_placement_can_be_taken_back(posed_room: Posed) -> None:
     np.testing.assert_allclose(applied, np.column_stack([placed["scale"] * rotation, placed["translation"]]))
 
 
-def test_points_have_the_colors_that_the_photos_show(posed_room: Posed) -> None:
+def test_points_have_the_colors_that_the_photos_show(posed_room: PosedScene) -> None:
     scene = load_scene(posed_room.path)
     view = scene.train[2]
     t = scene.points.xyz @ view.camera.viewmats[0, :3, :3].T + view.camera.viewmats[0, :3, 3]
@@ -72,7 +72,7 @@ def test_points_have_the_colors_that_the_photos_show(posed_room: Posed) -> None:
 
 
 def test_the_same_photos_give_the_same_bits_for_any_number_of_threads(
-    posed_room: Posed, room_photos: Path, tmp_path: Path
+    posed_room: PosedScene, room_photos: Path, tmp_path: Path
 ) -> None:
     again = pose_photos(room_photos, tmp_path / "again", replace(QUICK, threads=2))
     assert contents(again.path) == contents(posed_room.path)
@@ -114,7 +114,7 @@ def test_photos_stored_sideways_and_in_other_sizes_find_their_place(tmp_path: Pa
     assert [(frame.width, frame.height) for frame in source.frames][3:5] == [(400, 300), (320, 240)]
 
 
-def test_known_poses_are_kept_and_get_points(posed_room: Posed, tmp_path: Path) -> None:
+def test_known_poses_are_kept_and_get_points(posed_room: PosedScene, tmp_path: Path) -> None:
     known = tmp_path / "known"
     (known / "images").mkdir(parents=True)
     for path in (posed_room.path / "images").iterdir():
@@ -159,14 +159,16 @@ def test_too_few_photos_leave_nothing_behind(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
-def test_an_output_that_exists_is_left_alone(posed_room: Posed, room_photos: Path) -> None:
+def test_an_output_that_exists_is_left_alone(posed_room: PosedScene, room_photos: Path) -> None:
     before = contents(posed_room.path)
     with pytest.raises(UsageError, match="must not exist yet"):
         pose_photos(room_photos, posed_room.path, QUICK)
     assert contents(posed_room.path) == before
 
 
-def test_poses_are_looked_for_only_where_there_are_none(posed_room: Posed, room_photos: Path, tmp_path: Path) -> None:
+def test_poses_are_looked_for_only_where_there_are_none(
+    posed_room: PosedScene, room_photos: Path, tmp_path: Path
+) -> None:
     assert needs_poses(room_photos)
     assert not needs_poses(posed_room.path)
     assert not needs_poses(tmp_path)

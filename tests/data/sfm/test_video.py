@@ -10,7 +10,7 @@ import pytest
 import textured_room as room
 from PIL import Image, ImageFilter
 
-from gsopt.data.sfm.video import LEAST_MOTION, MOST_MOTION, Measured, choose, extract_frames, motion_between
+from gsopt.data.sfm.video import MAX_MOTION, MIN_MOTION, FrameMeasurement, choose, extract_frames, motion_between
 from gsopt.errors import InputError
 
 av = pytest.importorskip("av", reason="the extra sfm is not installed")
@@ -42,8 +42,8 @@ def test_frames_are_apart_by_the_motion_asked_for(pan: list[Image.Image], tmp_pa
     chosen = extract_frames(film(tmp_path / "pan.mp4", pan), tmp_path / "frames", 150)
     assert chosen.decoded == 60
     steps = np.diff(frame_numbers(chosen.paths)) * 4 / 320
-    assert steps.min() > 0.4 * LEAST_MOTION
-    assert steps.max() < MOST_MOTION
+    assert steps.min() > 0.4 * MIN_MOTION
+    assert steps.max() < MAX_MOTION
     assert 20 <= len(chosen.paths) < 45
 
 
@@ -60,7 +60,7 @@ def test_blurred_frames_are_passed_over(pan: list[Image.Image], tmp_path: Path) 
 
 
 def test_never_more_than_asked_for_and_spread_over_the_way() -> None:
-    measured = [Measured(i, i / 10, 1.0, 0.01 * i) for i in range(1000)]
+    measured = [FrameMeasurement(i, i / 10, 1.0, 0.01 * i) for i in range(1000)]
     chosen = choose(measured, 20)
     assert len(chosen) == 20
     assert np.ptp(np.diff(chosen)) <= 40
@@ -73,7 +73,7 @@ def test_motion_is_the_shift_of_the_picture() -> None:
     assert motion_between(before, after) == pytest.approx(10 / 256, abs=1 / 256)
     assert motion_between(before, before) == 0
     other = np.asarray(room.textures(8)[2].convert("L"), dtype=np.float32)[100:292, 100:356]
-    assert motion_between(before, other) == MOST_MOTION, "a cut is no small step"
+    assert motion_between(before, other) == MAX_MOTION, "a cut is no small step"
 
 
 def test_a_video_that_breaks_off_is_read_up_to_there(pan: list[Image.Image], tmp_path: Path) -> None:
