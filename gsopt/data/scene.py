@@ -57,7 +57,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a run learns from. World frame as in the source, less `origin`."""
+    """All input data of a run. World frame as in the source, less `origin`."""
 
     path: Path
     kind: str

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from gsopt.config.train import DataConfig, DensityConfig, InitConfig, TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
-from gsopt.data.split import farthest_points
 from gsopt.errors import InputError
 from gsopt.events import write_atomic
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.farthest_points import farthest_points
 from gsopt.init import first_gaussians
 from gsopt.raster.api import expected_depth
 from gsopt.raster.backend import Backend, RasterSettings

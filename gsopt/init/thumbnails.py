@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gsopt.data.resample import area_downscale, downscaled_size, premultiply
 from gsopt.data.scene import View
-from gsopt.data.split import farthest_points
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.farthest_points import farthest_points
 from gsopt.geometry.projection import inside, project
 
 MAX_SIDE = 512

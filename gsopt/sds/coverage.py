@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.data.split import farthest_points
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.farthest_points import farthest_points
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.quats import rotation_matrices
 from gsopt.geometry.sh import sh0_from_rgb

@@ -32,7 +32,7 @@ class FeatureInput:
 
 
 def prepare_masks(choice: str, source: Path, photos: list[Photo], work: Path) -> FeatureInput:
-    """Write the masks and opaque copies that `--masks` asks for into `work`. InputError where none fits."""
+    """Write the masks and opaque copies that `--masks` selects into `work`. InputError where none fits."""
     folder = source / "masks" if choice == "auto" else Path(choice).expanduser()
     has_alpha = any(photo.has_alpha for photo in photos)
     if choice not in ("alpha", "none") and folder.is_dir():

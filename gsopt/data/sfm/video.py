@@ -34,7 +34,7 @@ CENTRAL_SHARE = 0.6
 """Middle part of a stretch of motion in which its sharpest frame is looked for: keeps neighbors apart."""
 MIN_PEAK = 6.0
 """A correlation peak below this, over the root of a tile's pixels, means that two frames have nothing in common: a cut,
-or a jump. Noise peaks at 4.5 to 5, pictures of one thing that moved a little at 6 and far above."""
+or a jump. Noise peaks at 4.5 to 5, images of one thing that moved a little at 6 and far above."""
 _JPEG_QUALITY = 95
 
 
@@ -88,12 +88,12 @@ def measure(frames: Iterator[tuple[int, float, Image.Image]]) -> list[FrameMeasu
     anchor: Float32[np.ndarray, "h w"] | None = None
     way = 0.0
     for index, seconds, gray in frames:
-        picture = np.asarray(gray, dtype=np.float32)
-        if anchor is None or anchor.shape != picture.shape:
-            anchor = picture
-        step = motion_between(anchor, picture)
+        image = np.asarray(gray, dtype=np.float32)
+        if anchor is None or anchor.shape != image.shape:
+            anchor = image
+        step = motion_between(anchor, image)
         if step > MIN_STEP:
-            way, anchor = way + step, picture
+            way, anchor = way + step, image
         measured.append(FrameMeasurement(index, seconds, sharpness(gray), way))
     return measured
 

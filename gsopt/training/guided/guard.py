@@ -22,8 +22,8 @@ from torch import Tensor
 
 from gsopt.config.train import InitConfig, ScheduleConfig, TrainConfig
 from gsopt.data.scene import Scene, View
-from gsopt.data.split import farthest_points
 from gsopt.errors import NumericalError
+from gsopt.geometry.farthest_points import farthest_points
 from gsopt.init import first_gaussians
 from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
