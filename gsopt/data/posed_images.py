@@ -82,7 +82,7 @@ def read_pose(record: dict[str, Any], key: str, where: str) -> Float[Tensor, "4 
 
 
 def check_enough(frames: list[PosedImage], absent: list[str], path: Path) -> None:
-    """InputError when so many of the images that `path` names are absent that no two remain."""
+    """InputError when the absent images leave fewer than two of those that `path` names."""
     if absent and len(frames) < 2:
         raise InputError(
             f"Only {len(frames)} of the {len(frames) + len(absent)} images that {path} names exist; absent are "

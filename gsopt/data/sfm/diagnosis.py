@@ -64,7 +64,7 @@ class Diagnosis:
     advice: list[str] = field(default_factory=list)
     mapper: str = ""
     reprojection_error: float | None = None
-    """Mean, px of the full-size photos."""
+    """Mean reprojection error, px of the full-size photos."""
     track_length: float | None = None
     """Mean number of photos per point."""
     points: int = 0

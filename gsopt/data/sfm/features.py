@@ -163,7 +163,7 @@ def read_descriptors(pycolmap: ModuleType, database: Path, names: Sequence[str])
 
 
 def read_graph(pycolmap: ModuleType, database: Path) -> ViewGraph:
-    """The graph that lies in a database."""
+    """The graph stored in a database."""
     kinds = pycolmap.TwoViewGeometryConfiguration
     without_depth = {int(kinds.PANORAMIC), int(kinds.PLANAR_OR_PANORAMIC), int(kinds.PLANAR)}
     inliers: dict[Pair, int] = {}

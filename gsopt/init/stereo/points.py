@@ -109,7 +109,7 @@ def agreed(here: PlaneMap, others: Sequence[PlaneMap]) -> Bool[Tensor, "H W"]:
 
 
 def _angles(points: Float[Tensor, "N 3"], one: StereoImage, other: StereoImage) -> Float[Tensor, "N"]:
-    """Between the directions in which two cameras see points, degrees."""
+    """Angles between the directions in which two cameras see points, degrees."""
     a, b = points - one.camera.centers[0], points - other.camera.centers[0]
     across = torch.linalg.cross(a, b).norm(dim=-1)
     return torch.rad2deg(torch.atan2(across, (a * b).sum(-1)))
