@@ -76,7 +76,7 @@ def test_distances_scale_with_the_points_and_ignore_where_they_are() -> None:
 
 
 def test_leaves_that_hold_nothing_but_padding(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neighbors, "LEAF", 4)
+    monkeypatch.setattr(neighbors, "LEAF_POINTS", 4)
     monkeypatch.setattr(neighbors, "_LEAVES_AT_ONCE", 1)
     points = torch.rand(49, 3, generator=torch.Generator().manual_seed(0))
     distances = torch.cdist(points.double(), points.double()).fill_diagonal_(torch.inf)
