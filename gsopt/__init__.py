@@ -12,6 +12,7 @@ from gsopt._version import __version__ as __version__
 
 _HOME = {
     "Cameras": "gsopt.geometry.cameras",
+    "DataConfig": "gsopt.config.train",
     "Gaussians": "gsopt.gaussians",
     "GsoptError": "gsopt.errors",
     "RasterSettings": "gsopt.raster.backend",
@@ -21,12 +22,14 @@ _HOME = {
     "load_scene": "gsopt.data.scene",
     "load_splats": "gsopt.formats",
     "rasterize": "gsopt.raster.api",
+    "reconstruct": "gsopt.training.reconstruct",
     "save_splats": "gsopt.formats",
     "train": "gsopt.training.loop",
 }
 
 __all__ = [
     "Cameras",
+    "DataConfig",
     "Gaussians",
     "GsoptError",
     "RasterSettings",
@@ -36,12 +39,13 @@ __all__ = [
     "load_scene",
     "load_splats",
     "rasterize",
+    "reconstruct",
     "save_splats",
     "train",
 ]
 
 if TYPE_CHECKING:
-    from gsopt.config.train import TrainConfig
+    from gsopt.config.train import DataConfig, TrainConfig
     from gsopt.data.scene import Scene, load_scene
     from gsopt.errors import GsoptError
     from gsopt.formats import load_splats, save_splats
@@ -51,6 +55,7 @@ if TYPE_CHECKING:
     from gsopt.raster.backend import RasterSettings
     from gsopt.results.evaluation import evaluate
     from gsopt.training.loop import train
+    from gsopt.training.reconstruct import reconstruct
 
 
 def __getattr__(name: str) -> Any:

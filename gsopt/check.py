@@ -1,18 +1,67 @@
-"""Checks at the border: each raises an error that says what, got, do."""
+"""Checks at the border: each raises an error that states what was wrong, what was given and what to do."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
-from typing import TYPE_CHECKING
+import types
+import typing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from gsopt.errors import InputError, UsageError
+from gsopt.errors import InputError, SettingError, UsageError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
+@dataclass(frozen=True)
+class Within:
+    """Bounds of a setting, both included: `lr_last: Annotated[float, Within(1e-6, 1)] = 0.1`."""
+
+    low: float
+    high: float = math.inf
+
+    def __str__(self) -> str:
+        return f"be at least {self.low}" if math.isinf(self.high) else f"lie in [{self.low}, {self.high}]"
+
+
+def fields(settings: Any, section: str = "") -> None:
+    """Raise SettingError for the first field outside the bounds or choices of its type; None is always inside.
+
+    `section` is the name of these settings in config.json.
+    """
+    hints = _hints(type(settings))  # type: ignore[arg-type]
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if requirement := _broken(hints[field.name], value):
+            name = f"{section}.{field.name}" if section else field.name
+            default = "" if field.default is None else f" of {field.default}"
+            raise SettingError(f"`{name}` must {requirement}, got {value!r}. Leave it out for the default{default}.")
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls, include_extras=True)
+
+
+def _broken(hint: Any, value: Any) -> str:
+    """The first requirement of a type hint that the value breaks; empty when there is none."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if value is None:
+        return ""
+    if origin in (types.UnionType, typing.Union):
+        return next(filter(None, (_broken(arg, value) for arg in args)), "")
+    if origin is Literal:
+        return "" if value in args else f"be one of {', '.join(args)}"
+    if origin is Annotated:
+        return next((str(bound) for bound in args[1:] if not bound.low <= value <= bound.high), "")
+    return ""
+
+
 def at_least(name: str, value: float, minimum: float, remedy: str) -> None:
-    """Raise UsageError unless `value` is a number >= `minimum`; `remedy` says what to do instead."""
+    """Raise UsageError unless `value` is a number >= `minimum`; `remedy` is the advice at the end of the message."""
     if not value >= minimum:
         raise UsageError(f"`{name}` must be at least {minimum}, got {value}. {remedy}")
 

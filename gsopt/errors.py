@@ -1,6 +1,6 @@
-"""What can go wrong, and the exit code the command line answers with.
+"""The errors of gsopt and their exit codes.
 
-Every message says three things: what was wrong, what was got, and what to do about it.
+Every message states what was wrong, what was given, and what to do about it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ class UsageError(GsoptError):
     exit_code = 2
 
 
+class SettingError(UsageError):
+    """A setting is wrong. The message names settings as config.json does, in backticks: `optimizer.lr_last`."""
+
+
 class InputError(GsoptError):
     """A file, a folder or a tensor given to us is missing, broken or hostile (exit code 3)."""
 
@@ -31,6 +35,6 @@ class NumericalError(GsoptError):
 
 
 class MissingDependency(GsoptError):
-    """An optional package is not installed; the message carries the pip line that mends it (exit code 2)."""
+    """An optional package is not installed; the message carries the pip line that installs it (exit code 2)."""
 
     exit_code = 2

@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from gsopt.cli.console import report
-from gsopt.cli.train import read_ids
+from gsopt.cli.train_flags import read_ids
 from gsopt.finetune.on_views.training_config import Preparation, Study
 
 

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from gsopt.config.train import MAX_JSON_NUMBER
+from gsopt.config.from_json import MAX_JSON_NUMBER
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
 

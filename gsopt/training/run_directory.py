@@ -63,10 +63,8 @@ def opened(path: Path, config: TrainConfig, resume: bool, listener: Listener | N
     Raises UsageError when the folder holds another run, or when `resume` finds other settings than it started with.
     """
     make_folder(path)
-    if not resume and (work := work_in(path)):
-        raise UsageError(
-            f"{path} holds another run ({work.relative_to(path)}). Add --resume to continue it, or name another folder."
-        )
+    if not resume:
+        refuse_another_run(path)
     writer = EventWriter(path)
     run = RunDirectory(path, writer, listener)
     try:
@@ -88,6 +86,14 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"Cannot make the folder {path}: {error.strerror}. Choose another one.") from error
+
+
+def refuse_another_run(path: Path) -> None:
+    """Raise UsageError when the folder holds work that a new run would overwrite."""
+    if work := work_in(path):
+        raise UsageError(
+            f"{path} holds another run ({work.relative_to(path)}). Add --resume to continue it, or name another folder."
+        )
 
 
 def work_in(path: Path) -> Path | None:

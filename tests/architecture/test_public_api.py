@@ -12,6 +12,7 @@ import gsopt
 
 PUBLIC = {
     "Cameras",
+    "DataConfig",
     "Gaussians",
     "GsoptError",
     "RasterSettings",
@@ -21,6 +22,7 @@ PUBLIC = {
     "load_scene",
     "load_splats",
     "rasterize",
+    "reconstruct",
     "save_splats",
     "train",
 }

@@ -106,22 +106,25 @@ def test_gsopt_takes_the_flags(
     training: arguments.Training,
     guidance: arguments.Guidance,
 ) -> None:
-    tyro = pytest.importorskip("tyro")
-    from gsopt.cli.train import Flags
+    pytest.importorskip("tyro")
+    from gsopt.cli.train import read_flags
+    from gsopt.cli.train_flags import parse
+    from gsopt.config.presets import PRESETS
 
     words = arguments.train(Path("python"), tmp_path / "a b", tmp_path / "-run", training, guidance)
     assert words[:4] == ["python", "-m", "gsopt", "train"]
-    flags = tyro.cli(Flags, args=words[4:])
-    assert flags.preset == (training.preset or "default")
-    own = training if not training.preset else replace(arguments.Training(), iterations=None)  # shown and meant
-    assert (flags.iterations, flags.resolution, flags.seed) == (own.iterations, own.downscale, training.seed)
-    assert (flags.views or 0, flags.density.max_gaussians or 0) == (training.views, training.max_gaussians)
-    assert (flags.density.strategy, flags.background or "white") == (own.strategy, own.background)
-    assert (flags.threads, flags.backend, flags.eval) == (training.threads, training.backend, own.hold_out)
-    assert (str(flags.data), str(flags.run)) == (str(tmp_path / "a b"), str(tmp_path / "-run"))
+    config, run = read_flags(parse(words[4:]))
+    assert config.preset == (training.preset or "default")
+    preset = PRESETS[training.preset or "default"]
+    own = training if not training.preset else arguments.Training(iterations=preset.get("iterations", 7000))
+    assert (config.iterations, config.data.downscale, config.seed) == (own.iterations, own.downscale, training.seed)
+    assert (config.data.views or 0, config.density.max_gaussians or 0) == (training.views, training.max_gaussians)
+    assert (config.density.strategy, config.data.background) == (own.strategy, own.background)
+    assert (config.threads, config.backend, config.data.eval) == (training.threads, training.backend, own.hold_out)
+    assert (config.data.path, run) == (str(tmp_path / "a b"), tmp_path / "-run")
     weight = {"off": 0.0, "auto": None}.get(guidance.prior, guidance.weight)
-    assert flags.guidance.lambda_sds == weight
-    assert flags.guidance.ref_image == tuple(map(str, guidance.references))
+    assert config.guidance.lambda_sds == weight
+    assert config.guidance.ref_image == tuple(map(str, guidance.references))
 
 
 def test_gsopt_sfm_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import tyro
 from finished_runs import ring, splats, write_split
 
 from gsopt import cli
 from gsopt.cli.console import clock, progress_line
-from gsopt.cli.train import Density, Flags, make_config, read_flags, summary
-from gsopt.config.train import DensityConfig, TrainConfig
+from gsopt.cli.train import make_config, read_flags, summary
+from gsopt.cli.train_flags import FLAGS, Flags, flag_of, parse
+from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.events import read_events
 
@@ -46,7 +47,7 @@ def small(data: Path, run: Path) -> list[str]:
 
 
 def parsed(text: str) -> Flags:
-    return tyro.cli(Flags, args=text.split())
+    return parse(text.split())
 
 
 def config_of(text: str) -> TrainConfig:
@@ -120,8 +121,39 @@ def test_inria_spells_source_and_model_path() -> None:
         assert (Path(config.data.path).name, run) == ("D", Path("R"))
 
 
-def test_the_density_flags_are_the_density_settings() -> None:
-    assert dataclasses.asdict(Density()) == dataclasses.asdict(DensityConfig())
+def settings_of(values: dict[str, object], section: str = "") -> list[str]:
+    """Names of all settings, as an error writes them."""
+    names: list[str] = []
+    for key, value in values.items():
+        names += settings_of(value, f"{section}{key}.") if isinstance(value, dict) else [f"{section}{key}"]
+    return names
+
+
+def test_every_setting_has_one_flag_with_its_default_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    settings = settings_of(TrainConfig().to_dict())
+    assert set(FLAGS) < set(settings)
+    with pytest.raises(SystemExit):
+        parse(["--help"])
+    lines = re.sub("[│╭╮╰╯]", " ", capsys.readouterr().out)
+    text = " ".join(lines.split())
+    for setting in set(settings) - {"data.path"}:
+        assert re.search(rf"{re.escape(flag_of(setting))}[ ,]", text), setting
+
+
+@pytest.mark.parametrize(
+    ("argv", "error"),
+    [
+        ("--resolution 0", "`--resolution` must be at least 1, got 0. Leave it out for the default of 1."),
+        ("--iterations 0", "`--iterations` must be at least 1, got 0. Leave it out for the default of 7000."),
+        ("--optimizer.lr_last 2", "`--optimizer.lr-last` must lie in [1e-06, 1], got 2.0."),
+        ("--views 2 --view-ids 1", "`--views` and `--view-ids` were both given. Keep one of them."),
+        ("--guidance.t-max 0.01", "`--guidance.t-max` must not lie below `--guidance.t-min`, got 0.01 and 0.02."),
+        ("--lambda_sds -1", "`--lambda-sds` must lie in [0, 1000000000.0], got -1.0. Leave it out for the default."),
+    ],
+)
+def test_an_error_names_the_flag_and_not_the_setting(argv: str, error: str, capsys) -> None:
+    assert cli.main(["train", "DATA", *argv.split()]) == UsageError.exit_code
+    assert error in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -232,7 +264,7 @@ def test_a_failing_evaluation_is_the_last_event(data: Path, tmp_path: Path, monk
     def fail(*args: object, **kwargs: object) -> None:
         raise InputError("the test image vanished. Restore it.")
 
-    monkeypatch.setattr("gsopt.results.evaluation.evaluate", fail)
+    monkeypatch.setattr("gsopt.training.reconstruct.evaluate", fail)
     assert cli.main(["train", *small(data, tmp_path / "run")]) == 3
     assert "vanished" in capsys.readouterr().err
     assert kinds(tmp_path / "run")[-1] == "error"
@@ -263,7 +295,7 @@ def test_flags_become_settings_without_touching_the_disk(tmp_path: Path) -> None
 
 def test_a_resumed_run_keeps_its_own_pace_unless_told_otherwise(tmp_path: Path) -> None:
     flags = ["scene", "-m", str(tmp_path), "--threads", "1", "--preview-every", "0"]
-    config, _ = read_flags(tyro.cli(Flags, args=flags))
+    config, _ = read_flags(parse(flags))
     (tmp_path / "config.json").write_text(json.dumps({"config": config.to_dict()}))
-    again, _ = read_flags(tyro.cli(Flags, args=["--resume", "-m", str(tmp_path), "--checkpoint-every", "7"]))
+    again, _ = read_flags(parse(["--resume", "-m", str(tmp_path), "--checkpoint-every", "7"]))
     assert again == dataclasses.replace(config, checkpoint_every=7)

@@ -8,30 +8,19 @@ from typing import Any
 
 import pytest
 
-from gsopt.cli import train
+from gsopt.cli.train import read_flags
+from gsopt.cli.train_flags import parse
 from gsopt.config.presets import PRESETS, chosen, with_preset
 from gsopt.config.train import TrainConfig
 from gsopt.errors import UsageError
 
 
 @pytest.fixture
-def resolved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def resolved(tmp_path: Path):
     """The configuration that `gsopt train` would run with."""
 
     def resolve(*flags: str) -> TrainConfig:
-        found: list[TrainConfig] = []
-
-        class Enough(Exception):
-            pass
-
-        def caught(config: TrainConfig, run: Path) -> TrainConfig:
-            found.append(config)
-            raise Enough
-
-        monkeypatch.setattr(train, "with_poses", caught)
-        with pytest.raises(Enough):
-            train.main([str(tmp_path), "-m", str(tmp_path / "run"), "--lambda-sds", "0", *flags])
-        return found[0]
+        return read_flags(parse([str(tmp_path), "-m", str(tmp_path / "run"), "--lambda-sds", "0", *flags]))[0]
 
     return resolve
 
@@ -74,5 +63,5 @@ def test_a_switch_of_the_preset_can_be_switched_back(resolved) -> None:
 def test_what_is_no_preset_is_left_to_the_parser() -> None:
     assert chosen(["--preset"]) == chosen(["--preset", "best"]) == chosen([]) == "default"
     assert chosen(["--preset", "high", "--preset", "draft"]) == "draft"
-    with pytest.raises(UsageError, match="`--preset`"):
+    with pytest.raises(UsageError, match="`preset` must be one of draft, default, high"):
         TrainConfig(preset="best")  # type: ignore[arg-type]

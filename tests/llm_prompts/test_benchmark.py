@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import tyro
 
 from gsopt import cli
-from gsopt.cli.train import Flags, read_flags
+from gsopt.cli.train import read_flags
+from gsopt.cli.train_flags import parse
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.llm_prompts.schema import read_prompts
 
@@ -41,7 +41,7 @@ def test_every_arm_is_run_once_with_its_own_prompts_and_the_table_pairs_them(
     def gsopt(arguments: list[str]) -> int:
         if arguments[0] == "prompts":
             return cli.main(arguments)
-        config, run = read_flags(tyro.cli(Flags, args=arguments[1:]))
+        config, run = read_flags(parse(arguments[1:]))
         asked[run.name.rpartition("-")[2]] = config.guidance
         run.mkdir(parents=True)
         mean = {"psnr": 20.0 + len(config.guidance.prompts) % 2 + config.seed, "ssim": 0.5, "lpips_alex": None}

@@ -14,11 +14,12 @@ from scripted_server import completion, serving
 from tiny_scenes import write_dataset
 
 from gsopt import cli
-from gsopt.cli.train import Guidance, guidance_config
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError
 from gsopt.llm_prompts.review import Abandoned, edited, review
 from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, read_set, write_set
 from gsopt.training.guided.references import reference_paths
+from gsopt.training.guided.start import require_guidance
 
 NOTES = ["--notes", "femur, osteoporotic, CT", "--domain", "medicine"]
 HEAVY = {"torch", "numpy", "PIL", "pydantic", "tokenizers", "transformers", "diffusers", "urllib.request"}
@@ -145,13 +146,15 @@ def test_training_reads_the_prompts_and_the_pictures_that_were_accepted(tmp_path
     for picture in pictures:
         Image.new("RGB", (8, 8)).save(tmp_path / picture.file)
     write_set(tmp_path / "prompts.json", PromptSet((Prompt("a chair"),), images=pictures))
-    flags = Guidance(prompts=str(tmp_path / "prompts.json"), prior="a/b", ref_image=("mine.png",))
-    config = guidance_config(flags)
+    config = GuidanceConfig(prompts=str(tmp_path / "prompts.json"), prior="a/b", ref_image=("mine.png",))
     accepted = str(tmp_path / "prompts-images" / "001.png")
     assert reference_paths(config) == ("mine.png", accepted)
     old = replace(config, ref_image=("mine.png", accepted))  # a run of gsopt 0.1.0 recorded both
     assert reference_paths(old) == ("mine.png", accepted)
-    assert config.prompts == str(tmp_path / "prompts.json")
+    require_guidance(config)
+    (tmp_path / "prompts.json").write_text("{}")
+    with pytest.raises(InputError):
+        require_guidance(config)
 
 
 @pytest.mark.parametrize("with_prior", [False, True])

@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from PIL import Image
 
-from gsopt.config.train import MAX_JSON_NUMBER, TrainConfig
+from gsopt.config.from_json import MAX_JSON_NUMBER
+from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
 from gsopt.events import LARGEST_METRICS, read_events

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.init import first_gaussians
@@ -14,10 +15,24 @@ from gsopt.sds.guidance_step import Guidance, GuidanceSetup
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.select_prior import choose, fitting
 from gsopt.training.guided.guard import Verdict, evaluate_guidance
-from gsopt.training.guided.references import CONDITIONING, FOLDER, front_camera, make_conditioning
+from gsopt.training.guided.references import (
+    CONDITIONING,
+    FOLDER,
+    front_camera,
+    make_conditioning,
+    read_guidance_prompts,
+    reference_paths,
+)
 from gsopt.training.guided.session import RunGuidance
 from gsopt.training.plan import RunPlan
 from gsopt.training.run_directory import RunDirectory
+
+
+def require_guidance(config: GuidanceConfig) -> None:
+    """Raise InputError for a prompt that cannot be used, UsageError for guidance without a prior: before any work."""
+    read_guidance_prompts(config)
+    reference_paths(config)
+    choose(config)
 
 
 def start_guidance(

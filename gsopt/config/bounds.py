@@ -1,0 +1,16 @@
+"""Types of settings with their bounds."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from gsopt.check import Within
+
+MAX_WEIGHT = 1e9
+"""Upper bound of weights and rates: keeps infinities and typing errors out."""
+
+Weight = Annotated[float, Within(0, MAX_WEIGHT)]
+Decay = Annotated[float, Within(0, 0.999999)]
+Count = Annotated[int, Within(0)]
+PositiveCount = Annotated[int, Within(1)]
+ShDegree = Annotated[int, Within(0, 3)]

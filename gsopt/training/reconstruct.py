@@ -1,0 +1,128 @@
+"""One call from photos to a report: poses, training, evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from gsopt.config.train import DataConfig, TrainConfig
+from gsopt.data.sfm.reuse import needs_poses, posed_scene
+from gsopt.data.sfm.settings import SfmConfig
+from gsopt.errors import UsageError
+from gsopt.events import to_json, write_atomic
+from gsopt.gaussians import Gaussians
+from gsopt.results.evaluation import evaluate, read_metrics
+from gsopt.results.report import write_report
+from gsopt.training.guided.start import require_guidance
+from gsopt.training.loop import TrainResult, train
+from gsopt.training.run_directory import Listener, opened, refuse_another_run
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The result of `reconstruct`."""
+
+    run: Path
+    """Folder with splat.ply, metrics.json and report.html."""
+    gaussians: Gaussians
+    metrics: Mapping[str, Any] | None
+    """The content of metrics.json; None when the run was asked to stop before its last step."""
+    report: Path | None
+    """The report, None when the run was asked to stop."""
+
+
+def reconstruct(
+    data: Path | str | DataConfig | None,
+    run: Path | str,
+    *,
+    config: TrainConfig | None = None,
+    resume: bool = False,
+    on_progress: Listener | None = None,
+    log: Callable[[str], None] = lambda line: None,
+    **settings: Any,
+) -> Reconstruction:
+    """Find poses if `data` has none, train, evaluate on the held-out views and write the report: `gsopt train`.
+
+    `data`: a dataset, a folder of photos, a video, or a DataConfig; None takes that of `config`, or with `resume` the
+    settings in `run`. `settings`: fields of TrainConfig, a section as a dict: `preset="draft"`,
+    `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `on_progress` is called with every event, `log`
+    with lines for people. Raises a GsoptError; a wrong setting, prompt or prior raises it before any work.
+    """
+    run = Path(run)
+    config = _with_absolute_paths(_configured(data, run, config, resume, settings))
+    if not resume:
+        refuse_another_run(run)
+        require_guidance(config.guidance)
+    config = _with_poses(config, run, log)
+    result = train(config, run, resume=resume, on_progress=on_progress, done=False)
+    if result.stopped:
+        return Reconstruction(result.run, result.gaussians, None, None)
+    log(f"trained in {timedelta(seconds=round(result.train_seconds))}; evaluating {result.run / 'splat.ply'}")
+    metrics, report = _evaluated(config, result, on_progress)
+    return Reconstruction(result.run, result.gaussians, metrics, report)
+
+
+def _configured(
+    data: Path | str | DataConfig | None, run: Path, config: TrainConfig | None, resume: bool, settings: dict[str, Any]
+) -> TrainConfig:
+    """The settings of the run as given, or as recorded."""
+    if config is not None and settings:
+        raise UsageError(f"`config` and `{next(iter(settings))}` were both given. Keep one of them.")
+    if data is None and config is None:
+        if not resume or settings:
+            raise UsageError("A dataset is needed, got none. Give its folder, or only a run and resume=True.")
+        return TrainConfig.read(run / "config.json")
+    made = TrainConfig.of(**settings) if config is None else config
+    if data is None:
+        return made
+    return replace(made, data=data if isinstance(data, DataConfig) else replace(made.data, path=str(data)))
+
+
+def _with_absolute_paths(config: TrainConfig) -> TrainConfig:
+    """Paths made absolute, so that the run can be resumed from anywhere; names of models stay."""
+    guidance = replace(
+        config.guidance,
+        prompts=_absolute(config.guidance.prompts),
+        prior=_absolute(config.guidance.prior),
+        clip=_absolute(config.guidance.clip),
+        tiny_vae=_absolute(config.guidance.tiny_vae),
+        ref_image=tuple(map(_absolute, config.guidance.ref_image)),
+    )
+    path = str(Path(config.data.path).expanduser().absolute())
+    return replace(config, data=replace(config.data, path=path), guidance=guidance)
+
+
+def _absolute(name: str) -> str:
+    """The absolute path of something that exists, any other name as it is."""
+    path = Path(name).expanduser()
+    return str(path.absolute()) if name and path.exists() else name
+
+
+def _with_poses(config: TrainConfig, run: Path, log: Callable[[str], None]) -> TrainConfig:
+    """Photos or a video without poses become a posed scene beside the run; anything else is left as it is."""
+    data = Path(config.data.path)
+    if not needs_poses(data):
+        return config
+    scene = posed_scene(data, run.absolute().parent, SfmConfig(seed=config.seed, threads=config.threads), log)
+    return replace(config, data=replace(config.data, path=str(scene)))
+
+
+def _evaluated(config: TrainConfig, result: TrainResult, listener: Listener | None) -> tuple[dict[str, Any], Path]:
+    """Evaluate, write the report, and end the run with the event `done` (`error` when one of these fails)."""
+    facts = {
+        "train_seconds": round(result.train_seconds, 3),
+        "train_cpu_seconds": round(result.cpu_seconds, 3),
+        "peak_memory_mb": None if result.peak_memory_mb is None else round(result.peak_memory_mb, 1),
+        "n_gaussians": len(result.gaussians),
+        "steps": result.steps,
+        "init": result.init,
+    }
+    with opened(result.run, config, resume=True, listener=listener) as directory:
+        write_atomic(result.run / "metrics.json", to_json({**read_metrics(result.run), **facts}))
+        metrics = evaluate(result.run, threads=config.threads, scene=result.scene)
+        report = write_report(result.run)
+        directory.emit("done", step=result.steps, n=len(result.gaussians), seconds=facts["train_seconds"])
+    return metrics, report

@@ -1,0 +1,77 @@
+"""`gsopt.reconstruct`: the call behind `gsopt train`, with the same files, bits and refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_scenes import write_dataset
+
+import gsopt
+from gsopt import cli
+from gsopt.config.train import DataConfig, TrainConfig
+from gsopt.errors import GsoptError, InputError, SettingError, UsageError
+
+SHORT = {"iterations": 4, "init": {"method": "random", "count": 20}, "guidance": {"lambda_sds": 0.0}}
+FLAGS = "--iterations 4 --init random --init-count 20 --lambda_sds 0 --views 2"
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    write_dataset(tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+def test_python_and_the_command_line_write_the_same_run(data: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    events: list[str] = []
+    result = gsopt.reconstruct(
+        DataConfig(str(data), views=2),
+        tmp_path / "python",
+        on_progress=lambda event: events.append(event["kind"]),
+        log=lines.append,
+        **SHORT,
+    )
+    assert cli.main(["train", str(data), "-m", str(tmp_path / "flags"), *FLAGS.split()]) == 0
+    for name in ("config.json", "splat.ply"):
+        assert (tmp_path / "python" / name).read_bytes() == (tmp_path / "flags" / name).read_bytes()
+    assert result.metrics == json.loads((result.run / "metrics.json").read_bytes())
+    assert result.report == tmp_path / "python" / "report.html"
+    assert len(result.gaussians) == len(gsopt.load_splats(result.run / "splat.ply"))
+    assert (events[0], events[-1], events.count("done")) == ("started", "done", 1)
+    assert any("evaluating" in line for line in lines)
+
+
+def test_a_finished_run_is_refused_and_resumed_from_its_folder_alone(data: Path, tmp_path: Path) -> None:
+    first = gsopt.reconstruct(data, tmp_path / "run", **SHORT)
+    with pytest.raises(UsageError, match="holds another run"):
+        gsopt.reconstruct(data, tmp_path / "run", **SHORT)
+    again = gsopt.reconstruct(None, tmp_path / "run", resume=True)
+    assert again.metrics is not None
+    assert first.metrics is not None
+    assert again.metrics["mean"] == first.metrics["mean"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "text"),
+    [
+        ({"iterations": 0}, SettingError, "`iterations` must be at least 1, got 0"),
+        ({"iteratoins": 5}, InputError, "config.iteratoins"),
+        ({"seed": "1"}, InputError, "config.seed"),
+        ({"preset": "best"}, SettingError, "`preset` must be one of draft, default, high"),
+        ({"guidance": {"prompt": ["a \x1b chair"]}}, InputError, "control character"),
+        ({"guidance": {"prompts": "absent.json"}}, InputError, "absent.json"),
+        ({"config": TrainConfig(), "seed": 1}, UsageError, "Keep one"),
+    ],
+)
+def test_a_wrong_setting_or_prompt_is_refused_before_any_work(settings, error, text: str, tmp_path: Path) -> None:
+    with pytest.raises(error, match=text):
+        gsopt.reconstruct(tmp_path / "absent", tmp_path / "run", **settings)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_dataset_is_an_error_of_gsopt(tmp_path: Path) -> None:
+    for data, resume in ((None, False), (None, True), (tmp_path / "absent", False)):
+        with pytest.raises(GsoptError):
+            gsopt.reconstruct(data, tmp_path / "run", resume=resume)
