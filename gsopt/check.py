@@ -28,7 +28,7 @@ class Within:
 
 
 def fields(settings: Any, section: str = "") -> None:
-    """Raise SettingError for the first field outside the bounds or choices of its type; None is always inside.
+    """Raise SettingError for the first field outside the bounds or choices of its type; an open setting (None) passes.
 
     `section` is the name of these settings in config.json.
     """

@@ -15,7 +15,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "high": {"iterations": 15_000},
 }
-"""What each differs in from the defaults of TrainConfig, and of the flags of `gsopt train`."""
+"""Settings of each preset that differ from the defaults of TrainConfig."""
 
 
 def with_preset(record: T, name: str) -> T:

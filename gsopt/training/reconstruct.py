@@ -29,9 +29,9 @@ class Reconstruction:
     """Folder with splat.ply, metrics.json and report.html."""
     gaussians: Gaussians
     metrics: Mapping[str, Any] | None
-    """The content of metrics.json; None when the run was asked to stop before its last step."""
+    """The content of metrics.json, or None after a request to stop early."""
     report: Path | None
-    """The report, None when the run was asked to stop."""
+    """Path of report.html, or None likewise."""
 
 
 def reconstruct(
@@ -46,7 +46,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Find poses if `data` has none, train, evaluate on the held-out views and write the report: `gsopt train`.
 
-    `data`: a dataset, a folder of photos, a video, or a DataConfig; None takes that of `config`, or with `resume` the
+    `data`: a dataset, a folder of photos, a video, a DataConfig, or None for that of `config` or, with `resume`, the
     settings in `run`. `settings`: fields of TrainConfig, a section as a dict: `preset="draft"`,
     `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `on_progress` is called with every event, `log`
     with lines for people. Raises a GsoptError; a wrong setting, prompt or prior raises it before any work.

@@ -55,7 +55,6 @@ def test_the_page_is_short(readme: str) -> None:
     assert len(readme.splitlines()) <= MAX_LINES
 
 
-@pytest.mark.skipif("reconstruct" not in gsopt.__all__, reason="lands with the settings")
 def test_its_python_runs(readme: str, tmp_path: Path, monkeypatch, capsys) -> None:
     code = python_block(readme)
     assert "iterations=2000" in code

@@ -95,7 +95,7 @@ def test_poses_stay_as_given_until_start_and_without_the_flag(dataset: Path, tmp
 
 
 def test_a_rate_that_makes_no_sense_is_refused(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(UsageError, match=r"--poses\.lr"):
+    with pytest.raises(UsageError, match=r"`poses\.lr"):
         PoseConfig(lr=0.0)
     assert cli.main(["train", str(dataset), "--refine-poses", "--poses.start", "-1"]) == UsageError.exit_code
     assert "`--poses.start` must be at least 0, got -1" in capsys.readouterr().err
