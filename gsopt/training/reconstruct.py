@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -12,7 +12,7 @@ from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.data.sfm.reuse import needs_poses, posed_scene
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import Gaussians
 from gsopt.results.evaluation import evaluate, read_metrics
 from gsopt.results.report import write_report
@@ -41,7 +41,7 @@ def reconstruct(
     config: TrainConfig | None = None,
     resume: bool = False,
     on_progress: Listener | None = None,
-    log: Callable[[str], None] = lambda line: None,
+    log: Report = lambda line: None,
     **settings: Any,
 ) -> Reconstruction:
     """Find poses if `data` has none, train, evaluate on the held-out views and write the report: `gsopt train`.
@@ -101,7 +101,7 @@ def _absolute(name: str) -> str:
     return str(path.absolute()) if name and path.exists() else name
 
 
-def _with_poses(config: TrainConfig, run: Path, log: Callable[[str], None]) -> TrainConfig:
+def _with_poses(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
     """Photos or a video without poses become a posed scene beside the run; anything else is left as it is."""
     data = Path(config.data.path)
     if not needs_poses(data):
