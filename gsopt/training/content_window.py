@@ -40,7 +40,7 @@ class Window:
 
 
 def content_window(alphas: Float[Tensor, "H W"] | None) -> Window | None:
-    """The box of all that is not fully transparent, with a margin; None when that is nothing or nearly everything."""
+    """The box of all that is not fully transparent, with a margin, unless it is empty or nearly everything."""
     if alphas is None:
         return None
     shown = alphas > 0

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -24,6 +23,7 @@ from gsopt.training.optimizer import OptimizedGaussians, adam_step
 from gsopt.training.plan import RunPlan
 from gsopt.training.poses import PoseRefinement
 from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
+from gsopt.training.running_means import RunningMeans
 from gsopt.training.schedule import Flatness
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import Target, Targets
@@ -32,25 +32,8 @@ from gsopt.training.view_order import ViewOrder, generators
 if TYPE_CHECKING:
     from gsopt.training.guided.session import RunGuidance
 
-# Steps between two measurements of the PSNR that is displayed: the mean squared error costs a pass over the image.
-PSNR_EVERY = 10
-# Share of a new value in the running means that are displayed.
-NEW_VALUE_SHARE = 0.05
 # The parts of a model that a checkpoint carries.
 RECORDS = ("gaussians", "exp_avg", "exp_avg_sq")
-
-
-@dataclass
-class RunningMeans:
-    """Running means over steps, for display: nothing is decided by them."""
-
-    loss: float | None = None
-    mse: float | None = None
-
-    @property
-    def psnr(self) -> float | None:
-        """dB, from the running mean squared error over the input views as they were drawn; capped at 100."""
-        return None if self.mse is None else -10 * math.log10(max(self.mse, 1e-10))
 
 
 class Trainer:
@@ -158,7 +141,7 @@ class Trainer:
             self._bands.note(self.model.gaussians, target.camera, gradients)
         loss = photometric.loss * weight
         if target.color == 1:
-            self._update_means(loss, frame.colors, target)
+            self.means.update(self.step, loss, frame.colors, target)
         return loss, self._regularized(gradients, dropout)
 
     def _wants_absgrad(self) -> bool:
@@ -209,13 +192,6 @@ class Trainer:
     def _select(self, rows: Tensor) -> None:
         self.model = self.model.select(rows)
         self._density.select(rows)
-
-    def _update_means(self, loss: float, rendered: Float[Tensor, "H W 3"], target: Target) -> None:
-        means, share = self.means, NEW_VALUE_SHARE
-        means.loss = loss if means.loss is None else (1 - share) * means.loss + share * loss
-        if self.step % PSNR_EVERY == 1:
-            mse = target.share * float(torch.nn.functional.mse_loss(rendered, target.colors))
-            means.mse = mse if means.mse is None else (1 - share) * means.mse + share * mse
 
     @property
     def finished(self) -> bool:

@@ -1,4 +1,4 @@
-"""What the inputs decide, where guidance looks, and what word stands for a side."""
+"""Coverage by the inputs, candidate cameras of guidance, and the words for their sides."""
 
 from __future__ import annotations
 

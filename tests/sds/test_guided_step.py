@@ -239,7 +239,7 @@ def test_uncertain_views_are_drawn_more_often() -> None:
 
 
 def test_the_prior_is_told_everything_about_the_view() -> None:
-    """What a view-conditioned prior needs: the aligned render with alpha, its camera, the nearest references, words."""
+    """A view-conditioned prior gets the aligned render with alpha, its camera, the nearest references, words."""
     prior = toy(words=None)
     tokens = torch.arange(6.0).view(3, 2, 1).expand(3, 2, 4)
     words = Conditioning("fake", (Prompt("a chair"),), ("", "a chair", "a chair, overhead view"), tokens, None, None)

@@ -1,4 +1,4 @@
-"""Floaters are found by the distance to their neighbours, and nothing else is."""
+"""Floaters are found by the distance to their neighbors, and nothing else is."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_few_gaussians_have_no_floaters(count: int) -> None:
 def test_distances_are_those_to_the_nearest_others() -> None:
     means = blob(400)
     distances = torch.cdist(means.double(), means.double()) + torch.diag(torch.full((400,), torch.inf))
-    expected = distances.topk(20, largest=False).values.mean(dim=1)  # √400 neighbours
+    expected = distances.topk(20, largest=False).values.mean(dim=1)  # √400 neighbors
     torch.testing.assert_close(neighbor_distances(means), expected.float(), rtol=1e-4, atol=1e-5)
 
 

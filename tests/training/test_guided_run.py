@@ -125,7 +125,7 @@ def guard_of(run: Path) -> dict:
 
 
 def test_the_guard_lowers_what_makes_short_runs_worse(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
-    """Of a text-to-image prior."""
+    """A text-to-image prior is weighed by guided short runs."""
     prior.aligned = False
     prior.answer = lambda x_t, a, c: -torch.ones_like(x_t)  # everything is black
     hurting = config(dataset, guard_views=1, guard_steps=40, lambda_sds=50.0, weighting="x0", clip_rms=0.0)

@@ -1,4 +1,4 @@
-"""What `train` does with a run directory, tells on the way, and answers when something is wrong."""
+"""`train` and its run directory: files, events, and errors when something is wrong."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from gsopt.training.loop import train
 from gsopt.training.poses import PoseRefinement, pose_gradient, rigid_motion
 
 STEP = 1e-5
-"""Of the central differences; their error is about its square."""
+"""Step of the central differences; their error is about its square."""
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

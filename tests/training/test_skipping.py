@@ -1,4 +1,4 @@
-"""What is left out changes nothing that it must not change: windows, resting views, bands grown by the residual."""
+"""Skipped work changes nothing that it must not change: windows, resting views, bands grown by the residual."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_bands_are_watched_just_before_they_are_due() -> None:
 
 
 def passed_steps(dataset: Path, schedule: ScheduleConfig) -> tuple[int, list[float], Tensor]:
-    """How many of 30 steps computed nothing, all losses, and the last means."""
+    """Number of 30 steps that computed nothing, all losses, and the last means."""
     config = tiny_config(
         dataset,
         schedule=schedule,

@@ -1,4 +1,4 @@
-"""What a step compares with: the picture on its background, whatever is kept in memory."""
+"""The targets of a step: the picture on its background, whatever is kept in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene small enough for either rasteriser: a cloud of splats, drawn into a NeRF-synthetic folder."""
+"""A scene small enough for either rasterizer: a cloud of splats, drawn into a NeRF-synthetic folder."""
 
 from __future__ import annotations
 
