@@ -29,7 +29,7 @@ class Rendering:
     """On the background that was given, else premultiplied."""
     alphas: Float[Tensor, "C H W 1"]
     depths: Float[Tensor, "C H W 1"] | None
-    """Expected depth along the viewing axis, scene units, 0 where nothing was hit; None unless requested."""
+    """Expected depth along the viewing axis, scene units, 0 where nothing was hit, or None unless requested."""
     radii: Int[Tensor, "C N 2"]
     """Half-extent of each splat in px; 0 where it is not in the image."""
 

@@ -66,7 +66,7 @@ class RenderedFrame:
     """Composited on the background that was given, else premultiplied."""
     alphas: Float[Tensor, "H W"]
     depths: Float[Tensor, "H W"] | None
-    """Σ T alpha z, not normalized; None unless requested."""
+    """Σ T alpha z, not normalized, or None unless requested."""
     radii: Int[Tensor, "N 2"]
     """Half-extent of each splat's alpha >= 1/255 box in pixels, rounded up; 0 where it is not in the image."""
     context: object
@@ -87,7 +87,7 @@ class Gradients:
     means2d: Float[Tensor, "N 2"]
     """dLoss/d(mean2d), 1/px: signed sum over pixels."""
     means2d_abs: Float[Tensor, "N 2"] | None
-    """The same with absolute values summed over pixels (AbsGS, Ye et al. 2024); None unless requested."""
+    """The same with absolute values summed over pixels (AbsGS, Ye et al. 2024), or None unless requested."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def workspace(threads: int = 0) -> Any:
 @dataclass
 class _Context:
     frame: Any
-    """The kernels' buffers; None once given back."""
+    """The kernels' buffers, or None once given back."""
     model: Any
     gaussians: Gaussians
 

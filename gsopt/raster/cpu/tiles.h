@@ -1,4 +1,4 @@
-// The tiles that list a splat: those where its ellipse (docs/math.md, 8b, 8c) reaches a pixel center, or nearly (reach.h).
+// The tiles that list a splat: those where its ellipse (docs/math.md, 8b, 8c) reaches a pixel center, or nearly.
 //
 // Over a strip of rows its right end lies in the row nearest to that of its rightmost point; its left end mirrors that.
 // Tile x holds the pixel centers 16 x + 0.5 ... 16 x + 15.5.
