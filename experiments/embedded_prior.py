@@ -33,16 +33,16 @@ def measure(threads: int) -> dict[str, Any]:
 
     from gsopt.config.guidance import GuidanceConfig
     from gsopt.sds.load_prior import open_prior
-    from gsopt.sds.priors.view_conditioned import CHANNELS, TOKEN_WIDTH, Said, ViewPrior, predict
+    from gsopt.sds.priors.view_conditioned import INPUT_CHANNELS, TOKEN_WIDTH, TextTokens, ViewPrior, predict
 
     torch.set_num_threads(threads)
     prior = open_prior("embedded", GuidanceConfig())
     assert isinstance(prior, ViewPrior)
-    said = Said(torch.zeros(1, 8, TOKEN_WIDTH), torch.ones(1, 8, dtype=torch.bool))
+    said = TextTokens(torch.zeros(1, 8, TOKEN_WIDTH), torch.ones(1, 8, dtype=torch.bool))
 
     def call_seconds(side: int) -> float:
         start = time.perf_counter()
-        x_t, planes = torch.zeros(1, 3, side, side), torch.zeros(1, CHANNELS - 3, side, side)
+        x_t, planes = torch.zeros(1, 3, side, side), torch.zeros(1, INPUT_CHANNELS - 3, side, side)
         with torch.no_grad():
             predict(prior.unet, x_t, torch.tensor([300]), planes, said)
         return time.perf_counter() - start

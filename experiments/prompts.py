@@ -24,7 +24,7 @@ from typing import Any
 from gsopt.benchmark.machine import machine
 from gsopt.cli import main as gsopt
 from gsopt.events import to_json, write_atomic
-from gsopt.llm_prompts.schema import read_set, write_prompts
+from gsopt.sds.prompts import read_set, write_prompts
 
 HERE = Path(__file__).resolve().parent
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS"}

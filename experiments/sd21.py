@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "sds"))
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "sds")]
 
 from real_memory import account  # noqa: E402
 

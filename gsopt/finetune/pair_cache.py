@@ -1,4 +1,4 @@
-"""The renders a prior learns from, scene by scene; what is not there yet is made."""
+"""Caches the training renders of a prior, scene by scene."""
 
 from __future__ import annotations
 
@@ -17,47 +17,48 @@ from gsopt.events import Report
 from gsopt.finetune.reconstruction_pairs import Pairs, make_pairs
 from gsopt.raster.backend import Backend
 
-MADE_AS = 2
-"""Of what a pair shows; counted up when that changes, so that older files are made again."""
+PAIRS_VERSION = 2
+"""Version of the pairs' content; raised with a change of it, so that older files are recomputed."""
 
 
 @dataclass(frozen=True)
-class Library:
-    """M pairs and where they come from."""
+class PairCache:
+    """M pairs and their scenes."""
 
     pairs: Pairs
     scenes: tuple[Path, ...]
-    """Each has pairs."""
+    """The scenes that have pairs."""
     scene: Int[Tensor, "M"]
-    """Of each pair, an index into `scenes`."""
+    """Index into `scenes` of each pair."""
 
 
-def _made_by(scene: Path, size: int, seed: int) -> str:
-    """What a file of pairs depends on beside the fit's number: scenes of different folders may share a name."""
-    return hashlib.sha256(f"{scene.resolve()} {size} {seed} {MADE_AS}".encode()).hexdigest()[:8]
+def _cache_key(scene: Path, size: int, seed: int) -> str:
+    """Returns a hash of everything but the reconstruction's number: scenes of different folders may share a name."""
+    return hashlib.sha256(f"{scene.resolve()} {size} {seed} {PAIRS_VERSION}".encode()).hexdigest()[:8]
 
 
-def collect(
-    scenes: Sequence[Path], fits: int, size: int, seed: int, folder: Path, backend: Backend, report: Report
-) -> Library:
-    """All pairs of the scenes; what is not in `folder` is made. A scene that cannot be fitted is named and left out."""
+def collect_pairs(
+    scenes: Sequence[Path], reconstructions: int, size: int, seed: int, folder: Path, backend: Backend, report: Report
+) -> PairCache:
+    """Returns the pairs of all scenes and computes those missing in `folder`. A scene that fails is reported and
+    skipped."""
     folder.mkdir(parents=True, exist_ok=True)
     parts: list[Pairs] = []
     owners: list[int] = []
-    fitted: list[Path] = []
+    reconstructed: list[Path] = []
     for scene in scenes:
-        for fit in range(fits):
-            path = folder / f"{scene.name}_{fit}_{_made_by(scene, size, seed)}.safetensors"
+        for index in range(reconstructions):
+            path = folder / f"{scene.name}_{index}_{_cache_key(scene, size, seed)}.safetensors"
             if not is_regular(path):
                 try:
-                    make_pairs(scene, size, fit, seed, backend).save(path)
+                    make_pairs(scene, size, index, seed, backend).save(path)
                 except InputError as error:
-                    report(f"{scene.name} is left out: {error}")
+                    report(f"{scene.name} is skipped: {error}")
                     break
-                report(f"fitted {scene.name}, {fit + 1} of {fits}")
+                report(f"reconstructed {scene.name}, {index + 1} of {reconstructions}")
             parts.append(Pairs.load(path))
-            fitted += [scene] if scene not in fitted else []
-            owners += [len(fitted) - 1] * len(parts[-1])
+            reconstructed += [scene] if scene not in reconstructed else []
+            owners += [len(reconstructed) - 1] * len(parts[-1])
     if not parts:
         raise InputError(f"None of the {len(scenes)} scenes could be reconstructed. See the messages above.")
-    return Library(Pairs.cat(parts), tuple(fitted), torch.tensor(owners))
+    return PairCache(Pairs.cat(parts), tuple(reconstructed), torch.tensor(owners))

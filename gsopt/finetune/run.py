@@ -1,136 +1,101 @@
-"""`gsopt finetune` in order: fits, training, measurement, the prior's folder. Each part continues where it was."""
+"""Runs `gsopt finetune`: reconstructions, training, evaluation, the prior's folder. Each part is resumable."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsopt import check
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
-from gsopt.data.scene import is_posed
-from gsopt.errors import InputError, UsageError
+from gsopt.errors import InputError
 from gsopt.events import Report, to_json, write_atomic
-from gsopt.finetune.caption_tokens import Told, tell
-from gsopt.finetune.evaluation import measure, sheet
+from gsopt.finetune.caption_tokens import SceneCaptions, encode_captions
+from gsopt.finetune.evaluation import evaluate, sample_sheet
 from gsopt.finetune.folder import write_folder
-from gsopt.finetune.pair_cache import Library, collect
-from gsopt.finetune.text_encoder import find_encoder, said_of_all, words_known
-from gsopt.finetune.trainer import STATE, Training
-from gsopt.finetune.training_config import Course
+from gsopt.finetune.pair_cache import PairCache, collect_pairs
+from gsopt.finetune.scenes import TrainingScenes
+from gsopt.finetune.text_encoder import evaluate_encoder, make_encoder, scene_texts
+from gsopt.finetune.trainer import STATE, PriorTrainer
+from gsopt.finetune.training_config import PriorTrainingConfig
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
-from gsopt.sds.priors.view_conditioned import CARD, CLIP, ViewPrior, is_view_prior, make_deaf, make_unet, side_multiple
+from gsopt.sds.priors.view_conditioned import (
+    CARD_FILE,
+    CLIP_FOLDER,
+    ViewPrior,
+    is_view_prior,
+    make_unet,
+    zero_text_attention,
+)
 from gsopt.sds.select_prior import EMBEDDED
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""
-NEWS = 0.02
-"""Share of a new loss in the running mean that is shown."""
-
-
-@dataclass(frozen=True)
-class Lessons:
-    """Which scenes are learned from, and how often each is reconstructed."""
-
-    train: tuple[Path, ...]
-    val: tuple[Path, ...]
-    """Held out: only measured on."""
-    fits: int = 3
-    size: int = 128
-    """Side of the renders, px."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check.at_least("--fits", self.fits, 1, "3 is usual.")
-        check.within("--size", self.size, 64, 512, "The default is 128.")
-        if self.size % side_multiple():
-            near = round(self.size / side_multiple()) * side_multiple()
-            raise UsageError(f"`--size` must be a multiple of {side_multiple()}, got {self.size}. Try {near}.")
-
-
-def find_scenes(roots: Sequence[Path], val: Sequence[str]) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Posed scenes among and below `roots`, by name; those called `val` apart (none given: every tenth)."""
-    found: dict[str, Path] = {}
-    for path in (p for root in roots for p in (root, *sorted(root.iterdir() if root.is_dir() else ())) if _is(p)):
-        if found.setdefault(path.name, path) != path:
-            raise UsageError(f"{found[path.name]} and {path} have the same name. Rename one, or give only one of them.")
-    unknown = [name for name in val if name not in found]
-    if unknown:
-        raise UsageError(f"`--val` names {unknown[0]!r}, which is none of the {len(found)} scenes found. Correct it.")
-    names = sorted(found)
-    held = list(val) or names[9::10]
-    train = tuple(found[name] for name in names if name not in held)
-    if not train:
-        raise InputError(
-            f"No posed scene to learn from in {', '.join(map(str, roots))}. Give folders with transforms.json or "
-            "COLMAP models, or a folder of such folders (scripts/synth_views.py makes them)."
-        )
-    return train, tuple(found[name] for name in held)
-
-
-def _is(path: Path) -> bool:
-    return path.is_dir() and is_posed(path)
+LOSS_SMOOTHING = 0.02
+"""Share of a new loss in the displayed running mean."""
 
 
 def start(
-    lessons: Lessons, course: Course, out: Path, base: str | None, threads: int, report: Report
+    scenes: TrainingScenes, config: PriorTrainingConfig, out: Path, base: str | None, threads: int, report: Report
 ) -> dict[str, Any]:
-    """`finetune` on this machine's compiled backend; `base` as on the command line."""
+    """Runs `finetune` on this machine's compiled backend; `base` as on the command line."""
     if threads:
         torch.set_num_threads(threads)
     folder = None if base is None else EMBEDDED if base == "embedded" else Path(base)
-    return finetune(lessons, course, out, make_backend("auto", threads), folder, report)
+    return finetune(scenes, config, out, make_backend("auto", threads), folder, report)
 
 
 def finetune(
-    lessons: Lessons, course: Course, out: Path, backend: Backend, base: Path | None, report: Report
+    scenes: TrainingScenes, config: PriorTrainingConfig, out: Path, backend: Backend, base: Path | None, report: Report
 ) -> dict[str, Any]:
-    """Train a prior into `out` and return what was measured on the held-out scenes.
+    """Trains a prior into `out` and returns its evaluation on the held-out scenes.
 
-    Run again after a kill it goes on where it was. Raises InputError for scenes that cannot be read and for an `out`
+    Resumes after a kill. Raises InputError for scenes that cannot be read and for an `out`
     that holds something else.
     """
-    _claim(out, lessons, course, base)
-    train, val = (_library(scenes, lessons, out / "pairs", backend, report) for scenes in (lessons.train, lessons.val))
+    _claim_folder(out, scenes, config, base)
+    train, val = (_library(paths, scenes, out / "pairs", backend, report) for paths in (scenes.train, scenes.val))
     assert train is not None
     held = 0 if val is None else len(val.pairs)
-    report(f"{len(train.pairs)} renders of {len(lessons.train)} scenes to learn from, {held} held out")
-    encoder = find_encoder(train, course, out / CLIP, base, report)
-    told, told_val = (
-        None if encoder is None or part is None else tell(encoder, part, said_of_all(part)) for part in (train, val)
+    report(f"{len(train.pairs)} renders of {len(scenes.train)} scenes to train on, {held} held out")
+    encoder = make_encoder(train, config, out / CLIP_FOLDER, base, report)
+    captions, told_val = (
+        None if encoder is None or part is None else encode_captions(encoder, part, scene_texts(part))
+        for part in (train, val)
     )
-    training = Training(make_unet(course.seed) if base is None else _base(base, told is not None), course, told)
+    trainer = PriorTrainer(
+        make_unet(config.seed) if base is None else _base(base, captions is not None), config, captions
+    )
     if (out / STATE).exists():
-        training.restore(out / STATE)
-        report(f"continuing at step {training.step}")
-    if training.step == course.steps and (out / CARD).exists():
-        return dict(read_json(out / CARD).get("measured") or {})
-    training.run(train.pairs, out, _Log(out, training, val, told_val, report))
-    unet = training.averaged()
-    measured = {} if val is None else measure(unet, val.pairs, told_val)
+        trainer.restore(out / STATE)
+        report(f"continuing at step {trainer.step}")
+    if trainer.step == config.steps and (out / CARD_FILE).exists():
+        return dict(read_json(out / CARD_FILE).get("measured") or {})
+    trainer.run(train.pairs, out, _Log(out, trainer, val, told_val, report))
+    unet = trainer.use_average()
+    evaluation = {} if val is None else evaluate(unet, val.pairs, told_val)
     if encoder is not None and val is not None:
-        measured |= {"words": words_known(encoder, val)}
-    write_folder(out, unet, lessons, course, base, measured)
-    return measured
+        evaluation |= {"words": evaluate_encoder(encoder, val)}
+    write_folder(out, unet, scenes, config, base, evaluation)
+    return evaluation
 
 
-def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> None:
-    """Remember what `out` is made from; InputError where it is something else."""
+def _claim_folder(out: Path, scenes: TrainingScenes, config: PriorTrainingConfig, base: Path | None) -> None:
+    """Writes the training plan to `out`; raises InputError when `out` belongs to another one."""
     path = out / "finetune.json"
     plan = {
-        "course": asdict(course),
-        "fits": lessons.fits,
-        "size": lessons.size,
-        "seed": lessons.seed,
-        "train": [scene.name for scene in lessons.train],
-        "val": [scene.name for scene in lessons.val],
+        "course": asdict(config),
+        "fits": scenes.reconstructions,
+        "size": scenes.size,
+        "seed": scenes.seed,
+        "train": [scene.name for scene in scenes.train],
+        "val": [scene.name for scene in scenes.val],
         "base": None if base is None else base.name,
     }
     if path.exists():
@@ -144,37 +109,39 @@ def _claim(out: Path, lessons: Lessons, course: Course, base: Path | None) -> No
 
 
 def _library(
-    scenes: Sequence[Path], lessons: Lessons, folder: Path, backend: Backend, report: Report
-) -> Library | None:
-    if not scenes:
+    paths: Sequence[Path], scenes: TrainingScenes, folder: Path, backend: Backend, report: Report
+) -> PairCache | None:
+    if not paths:
         return None
-    return collect(scenes, lessons.fits, lessons.size, lessons.seed, folder, backend, report)
+    return collect_pairs(paths, scenes.reconstructions, scenes.size, scenes.seed, folder, backend, report)
 
 
-def _base(folder: Path, told: bool) -> Any:
-    """The network to start from; one that was never told anything goes on as it was."""
+def _base(folder: Path, captions: bool) -> Any:
+    """Loads the network to start from; text attention that was not trained yet starts without effect."""
     if not is_view_prior(folder):
         raise InputError(
             f"`--base` {folder} is no view-conditioned prior. Give a folder that `gsopt finetune` wrote; "
             "to train Stable Diffusion on images, add --on-views."
         )
     unet = ViewPrior(folder, GuidanceConfig()).unet.requires_grad_(True)
-    if told and not (folder / CLIP).is_dir():
-        make_deaf(unet)
+    if captions and not (folder / CLIP_FOLDER).is_dir():
+        zero_text_attention(unet)
     return unet
 
 
 class _Log:
-    """Hears every step: a line now and then, train.jsonl, and sample sheets of held-out renders."""
+    """Logs every step: progress lines, train.jsonl, and sample sheets of held-out renders."""
 
-    def __init__(self, out: Path, training: Training, val: Library | None, told: Told | None, report: Report) -> None:
-        self._out, self._course, self._training, self._report = out, training.course, training, report
-        self._val, self._told = val, told
+    def __init__(
+        self, out: Path, trainer: PriorTrainer, val: PairCache | None, captions: SceneCaptions | None, report: Report
+    ) -> None:
+        self._out, self._course, self._training, self._report = out, trainer.config, trainer, report
+        self._val, self._told = val, captions
         self._mean: float | None = None
-        self._began, self._first = time.monotonic(), training.step
+        self._began, self._first = time.monotonic(), trainer.step
 
     def __call__(self, step: int, found: float) -> None:
-        self._mean = found if self._mean is None else self._mean + NEWS * (found - self._mean)
+        self._mean = found if self._mean is None else self._mean + LOSS_SMOOTHING * (found - self._mean)
         if step % 100 == 0 or step == self._course.steps:
             seconds = time.monotonic() - self._began
             left = seconds / max(1, step - self._first) * (self._course.steps - step)
@@ -185,10 +152,10 @@ class _Log:
             self._show(step)
 
     def _show(self, step: int) -> None:
-        unet = self._training.averaged()
+        unet = self._training.use_average()
         folder = self._out / "samples"
         folder.mkdir(exist_ok=True)
         assert self._val is not None
         with torch.no_grad():
-            sheet(unet, self._val.pairs, self._told).save(folder / f"step_{step:06d}.png")
-        self._training.back()
+            sample_sheet(unet, self._val.pairs, self._told).save(folder / f"step_{step:06d}.png")
+        self._training.use_trained()

@@ -1,4 +1,4 @@
-"""Where a prior's words come from: the CLIP of the prior it starts from, or one trained on its scenes' captions."""
+"""Provides a prior's text encoder: the CLIP of its base, or one trained on the captions of its scenes."""
 
 from __future__ import annotations
 
@@ -9,62 +9,62 @@ from typing import Any
 import torch
 
 from gsopt.events import Report
-from gsopt.finetune.captions import said_of
+from gsopt.finetune.captions import read_captions
 from gsopt.finetune.clip import save_clip, train_clip
-from gsopt.finetune.pair_cache import Library
-from gsopt.finetune.training_config import Course
+from gsopt.finetune.pair_cache import PairCache
+from gsopt.finetune.training_config import PriorTrainingConfig
 from gsopt.sds.priors.clip import ClipEncoder, load_joint_clip
-from gsopt.sds.priors.view_conditioned import CLIP
+from gsopt.sds.priors.view_conditioned import CLIP_FOLDER
 
-FEWEST = 2
-"""Different captions that a CLIP can learn anything from."""
-SHOWN = 4
-"""Pictures per held-out scene that captions are matched with."""
-
-
-def said_of_all(library: Library) -> list[tuple[str, ...]]:
-    """The texts of every scene; none where nobody wrote any."""
-    return [said_of(scene) for scene in library.scenes]
+MIN_CAPTIONS = 2
+"""Least number of different captions for training a CLIP."""
+SHOWN_IMAGES = 4
+"""Images per held-out scene that are matched with captions."""
 
 
-def find_encoder(
-    library: Library, course: Course, folder: Path, base: Path | None, report: Report
+def scene_texts(cache: PairCache) -> list[tuple[str, ...]]:
+    """Returns the texts of every scene, empty for a scene without captions."""
+    return [read_captions(scene) for scene in cache.scenes]
+
+
+def make_encoder(
+    cache: PairCache, config: PriorTrainingConfig, folder: Path, base: Path | None, report: Report
 ) -> ClipEncoder | None:
-    """The encoder of the words to be taught, kept in `folder`; None where there are none to teach."""
+    """Returns the text encoder kept in `folder`, trained if necessary, or `None` without captions."""
     if not folder.is_dir():
         unfinished = folder.with_name(f"{folder.name}.part")
-        if base is not None and (base / CLIP).is_dir():
-            shutil.copytree(base / CLIP, unfinished, dirs_exist_ok=True)
+        if base is not None and (base / CLIP_FOLDER).is_dir():
+            shutil.copytree(base / CLIP_FOLDER, unfinished, dirs_exist_ok=True)
         else:
-            said = said_of_all(library)
-            if course.clip_steps == 0 or len({texts[0] for texts in said if texts}) < FEWEST:
+            texts_by_scene = scene_texts(cache)
+            if config.clip_steps == 0 or len({texts[0] for texts in texts_by_scene if texts}) < MIN_CAPTIONS:
                 report(
-                    "no words: " + ("--clip-steps is 0" if course.clip_steps == 0 else "the scenes have no captions")
+                    "no words: " + ("--clip-steps is 0" if config.clip_steps == 0 else "the scenes have no captions")
                 )
                 return None
-            model, tokenizer = train_clip(library, said, course.clip_steps, course.seed, report)
+            model, tokenizer = train_clip(cache, texts_by_scene, config.clip_steps, config.seed, report)
             save_clip(model, tokenizer, unfinished)
         unfinished.rename(folder)
     clip = load_joint_clip(folder, torch.float32)
-    return ClipEncoder(CLIP, clip.text, clip.image, clip, whole_words=True)
+    return ClipEncoder(CLIP_FOLDER, clip.text, clip.image, clip, whole_words=True)
 
 
-def words_known(encoder: ClipEncoder, library: Library) -> dict[str, Any]:
-    """How well held-out scenes are understood: the share of their captions' words that were never met, and how often a
-    picture fits its own caption better than all others, beside the share that guessing gives."""
-    said = said_of_all(library)
-    captions = [texts[0] for texts in said if texts]
+def evaluate_encoder(encoder: ClipEncoder, cache: PairCache) -> dict[str, Any]:
+    """Returns the share of unknown words in held-out captions, and the share of images that match their own caption
+    best, beside the share by guessing."""
+    texts_by_scene = scene_texts(cache)
+    captions = [texts[0] for texts in texts_by_scene if texts]
     words = {word for caption in captions for word in caption.split()}
     unknown = {word for caption in captions for word in encoder.unknown_words(caption)}
     different = sorted(set(captions))
     if not different:
         return {}
     right = []
-    for index, texts in enumerate(said):
+    for index, texts in enumerate(texts_by_scene):
         if not texts:
             continue
-        rows = torch.nonzero(library.scene == index)[:, 0][:SHOWN]
-        rgba = library.pairs.truth[rows].float() / 255
+        rows = torch.nonzero(cache.scene == index)[:, 0][:SHOWN_IMAGES]
+        rgba = cache.pairs.truth[rows].float() / 255
         found = encoder.alignment(different, rgba[:, :3] + 1 - rgba[:, 3:])
         assert found is not None
         right += (found.argmax(0) == different.index(texts[0])).tolist()

@@ -1,4 +1,4 @@
-"""The training of a view-conditioned prior: x0 by least squares, averaged weights, resumable to the bit."""
+"""Trains a view-conditioned prior: x0 by least squares, averaged weights, resumable bit for bit."""
 
 from __future__ import annotations
 
@@ -15,55 +15,56 @@ from torch import Tensor
 
 from gsopt.errors import InputError, NumericalError
 from gsopt.events import write_atomic
-from gsopt.finetune.batches import Batch, draw
-from gsopt.finetune.caption_tokens import Told
+from gsopt.finetune.batches import Batch, draw_batch
+from gsopt.finetune.caption_tokens import SceneCaptions
 from gsopt.finetune.reconstruction_pairs import Pairs
-from gsopt.finetune.training_config import Course
+from gsopt.finetune.training_config import PriorTrainingConfig
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.view_conditioned import cosine_schedule, predict
 
 EDGE_WEIGHT = 0.1
-"""Of the error of the image's differences, against blur."""
+"""Weight of the error of the image gradients, against blur."""
 STATE = "training.safetensors"
 
 
-class Training:
-    """Network, averaged weights and optimizer of one course."""
+class PriorTrainer:
+    """Network, averaged weights and optimizer of one training."""
 
-    def __init__(self, unet: Any, course: Course, told: Told | None = None) -> None:
-        self.unet, self.course, self.told, self.step = unet.train(), course, told, 0
+    def __init__(self, unet: Any, config: PriorTrainingConfig, captions: SceneCaptions | None = None) -> None:
+        self.unet, self.config, self.captions, self.step = unet.train(), config, captions, 0
         self.average = {name: value.detach().clone() for name, value in unet.state_dict().items()}
         self.optimizer = torch.optim.AdamW(
-            unet.parameters(), lr=course.lr, weight_decay=course.weight_decay, betas=(0.9, 0.99), fused=True
+            unet.parameters(), lr=config.lr, weight_decay=config.weight_decay, betas=(0.9, 0.99), fused=True
         )
         self.noise = cosine_schedule()
 
     def advance(self, pairs: Pairs) -> float:
-        """One step; its loss. NumericalError when that is not finite: the last saved state is the good one."""
-        random = generator(self.course.seed, self.step, 0, "lessons")
-        batch = draw(pairs, self.course.batch, self.noise, random, self.told)
+        """Takes one step and returns its loss. Raises NumericalError when it is not finite; the last saved state is
+        valid."""
+        random = generator(self.config.seed, self.step, 0, "lessons")
+        batch = draw_batch(pairs, self.config.batch, self.noise, random, self.captions)
         found = loss(self.unet, batch)
         if not bool(torch.isfinite(found)):
             raise NumericalError(f"The loss of step {self.step} is {float(found)}. Lower --lr and run again.")
         for group in self.optimizer.param_groups:
-            group["lr"] = self.course.rate(self.step)
+            group["lr"] = self.config.rate(self.step)
         self.optimizer.zero_grad(set_to_none=True)
         found.backward()
         torch.nn.utils.clip_grad_norm_(self.unet.parameters(), 1.0)
         self.optimizer.step()
         self.step += 1
-        decay = min(self.course.ema, self.step / (self.step + 10))
+        decay = min(self.config.ema, self.step / (self.step + 10))
         with torch.no_grad():
             for name, value in self.unet.state_dict().items():
                 self.average[name].lerp_(value, 1 - decay)
         return float(found.detach())
 
-    def run(self, pairs: Pairs, folder: Path, told: Callable[[int, float], None]) -> None:
-        """To the end of the course, saving on the way; `told` hears every step and its loss."""
-        while self.step < self.course.steps:
+    def run(self, pairs: Pairs, folder: Path, on_step: Callable[[int, float], None]) -> None:
+        """Trains to the last step and saves regularly; calls `on_step` with every step and its loss."""
+        while self.step < self.config.steps:
             found = self.advance(pairs)
-            told(self.step, found)
-            if self.step % self.course.save_every == 0 or self.step == self.course.steps:
+            on_step(self.step, found)
+            if self.step % self.config.save_every == 0 or self.step == self.config.steps:
                 self.save(folder / STATE)
 
     def save(self, path: Path) -> None:
@@ -72,18 +73,18 @@ class Training:
         moments = self.optimizer.state_dict()["state"]
         for index, record in moments.items():
             tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in record.items()}
-        meta = json.dumps({"step": self.step, "course": asdict(self.course)})
+        meta = json.dumps({"step": self.step, "course": asdict(self.config)})
         write_atomic(path, save({k: v.contiguous() for k, v in tensors.items()}, metadata={"gsopt": meta}))
 
     def restore(self, path: Path) -> None:
-        """Inverse of `save`. InputError for another course's state or a broken file."""
+        """Inverse of `save`. Raises InputError for the state of another configuration or a broken file."""
         try:
             with safe_open(path, framework="pt") as file:
                 meta = json.loads((file.metadata() or {})["gsopt"])
-                # Cloned: in the file they begin anywhere, and products of matrices round differently there.
+                # Cloned: in the file they may be unaligned, where matrix products round differently.
                 tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
-            if meta["course"] != asdict(self.course):
-                raise ValueError(f"it belongs to a course with {meta['course']}")
+            if meta["course"] != asdict(self.config):
+                raise ValueError(f"it belongs to a training with {meta['course']}")
             self.unet.load_state_dict(_part(tensors, "unet."))
             self.average = _part(tensors, "average.")
             records: dict[int, dict[str, Tensor]] = {}
@@ -98,21 +99,22 @@ class Training:
                 f"Cannot continue from {path} ({error}). Give the flags the training began with, or another -o."
             ) from error
 
-    def averaged(self) -> Any:
-        """The network with the averaged weights, ready to be used."""
+    def use_average(self) -> Any:
+        """Loads the averaged weights and returns the network in evaluation mode."""
         own = {name: value.clone() for name, value in self.unet.state_dict().items()}
         self.unet.load_state_dict(self.average)
-        self._own = own
+        self._trained_weights = own
         return self.unet.eval()
 
-    def back(self) -> None:
-        """After `averaged`: the weights that are being trained."""
-        self.unet.load_state_dict(self._own)
+    def use_trained(self) -> None:
+        """Loads the trained weights again after `use_average`."""
+        self.unet.load_state_dict(self._trained_weights)
         self.unet.train()
 
 
 def loss(unet: Any, batch: Batch) -> Tensor:
-    """Weighted mean over the lessons of the squared error of x0_hat and the absolute error of its differences."""
+    """Returns the weighted mean over the batch of the squared error of x0_hat and the absolute error of its
+    gradients."""
     error = predict(unet, batch.x_t, batch.t, batch.planes, batch.said) - batch.x0
     inside = (1, 2, 3)
     edges = error.diff(dim=-1).abs().mean(inside) + error.diff(dim=-2).abs().mean(inside)

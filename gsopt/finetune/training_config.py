@@ -1,4 +1,4 @@
-"""How a prior is trained: numbers only, no torch."""
+"""Configuration of a prior's training, free of torch."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from gsopt import check
 
 
 @dataclass(frozen=True)
-class Course:
-    """How a prior is trained."""
+class PriorTrainingConfig:
+    """Settings of a prior's training."""
 
     steps: int = 6000
     batch: int = 16
     lr: float = 4e-4
-    """Highest; reached after 2 % of the steps, then a cosine down to 2 %."""
+    """Peak learning rate; reached after 2 % of the steps, then a cosine down to 2 %."""
     weight_decay: float = 0.01
     ema: float = 0.999
-    """Decay of the averaged weights, which are the ones that are kept; lower at first."""
+    """Decay of the averaged weights, which the prior keeps; lower at first."""
     save_every: int = 200
     seed: int = 0
     clip_steps: int = 1000
-    """Steps of the CLIP that learns the scenes' captions, where they have captions and --base has no CLIP."""
+    """Training steps of the CLIP for the scenes' captions, when they have captions and --base has no CLIP."""
 
     def __post_init__(self) -> None:
         check.at_least("--steps", self.steps, 1, "A few thousand are a start.")
         check.at_least("--batch", self.batch, 1, "16 is usual.")
-        check.at_least("--clip-steps", self.clip_steps, 0, "0 trains none: the prior takes no words.")
+        check.at_least("--clip-steps", self.clip_steps, 0, "0 trains none: the prior takes no text.")
         check.within("--lr", self.lr, 0.0, 1.0, "The default is 4e-4.")
 
     def rate(self, step: int) -> float:
-        """Learning rate of a step, from 0."""
+        """Returns the learning rate of a step, counted from 0."""
         warm = max(1, self.steps // 50)
         progress = min(1.0, max(0.0, (step - warm) / max(1, self.steps - warm)))
         return self.lr * min(1.0, (step + 1) / warm) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))

@@ -1,7 +1,7 @@
-"""A language model behind the OpenAI-compatible protocol: one POST to URL/chat/completions. Standard library only.
+"""Client of a language model with the OpenAI-compatible protocol: POST to URL/chat/completions. Standard library only.
 
-The server is untrusted: no redirects (they could carry the key elsewhere), answers bounded in size, the whole exchange
-bounded in time however slowly the bytes come. The key comes from the environment and is neither shown nor saved.
+The server is untrusted: no redirects (they could leak the key), bounded responses, and a deadline for the whole
+exchange even if bytes arrive slowly. The key comes from the environment and is neither displayed nor saved.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from typing import Any
 from gsopt.errors import InputError, UsageError
 from gsopt.llm_prompts.sanitize import printable
 
-LARGEST_ANSWER = 4 << 20
-"""Bytes of an HTTP answer that are read."""
+MAX_RESPONSE_BYTES = 4 << 20
+"""Size limit of an HTTP response, bytes."""
 CHUNK = 1 << 16
 KEY_VARIABLE = "GSOPT_LLM_KEY"
-LONGEST_WAIT = 20.0
-"""Seconds that a busy server may ask for between two tries."""
-TRIES = 3
-BUSY = (408, 429, 502, 503, 504)
+MAX_RETRY_WAIT = 20.0
+"""Longest wait between two tries that a busy server may request, seconds."""
+MAX_TRIES = 3
+BUSY_STATUSES = (408, 429, 502, 503, 504)
 REMEDY = "Check --llm and the server, or write prompts without a model: --llm none."
-ADVICE = {
+STATUS_ADVICE = {
     401: f"The key is missing or wrong: set the environment variable {KEY_VARIABLE}.",
     403: f"The key may not use this model: check {KEY_VARIABLE} and --model.",
     404: "The address or the model is unknown there: check --llm (it usually ends in /v1) and --model.",
@@ -41,45 +41,45 @@ ADVICE = {
 }
 
 
-class Refusal(InputError):
-    """The server did not give an answer that can be used."""
+class ServerError(InputError):
+    """The server returned no usable response."""
 
     def __init__(self, message: str, status: int | None = None, wait: float | None = None) -> None:
         super().__init__(message)
         self.status = status
-        """HTTP status; None where there was none."""
+        """HTTP status, or `None` without a response."""
         self.wait = wait
-        """Seconds the server asks to wait."""
+        """Wait requested by the server, seconds."""
 
 
 @dataclass(frozen=True)
 class Server:
-    """Where the model is."""
+    """Address, model and key of a server."""
 
     url: str
     """Base, e.g. http://localhost:11434/v1."""
     model: str
     deadline: float
-    """time.monotonic() at which everything has to be over."""
+    """Deadline of the whole exchange, in time.monotonic()."""
     key: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True)
-class Answer:
+class Completion:
     """One chat completion."""
 
     text: str
     tokens_in: int | None
     tokens_out: int | None
     finish: str
-    """Why the model stopped: stop, length, ..."""
+    """Finish reason: stop, length, ..."""
     seconds: float
 
 
 def connect(url: str, model: str, timeout: float, environment: Mapping[str, str] = os.environ) -> Server:
-    """A server whose address and model are known. `model` empty: the only one it has.
+    """Returns a server with checked address and known model; an empty `model` selects the only one it has.
 
-    Raises UsageError for an address that cannot be used or a choice of models, Refusal where nobody answers.
+    Raises UsageError for an invalid address or an ambiguous model, ServerError without a response.
     """
     base = read_url(url)
     server = Server(base, model, time.monotonic() + timeout, find_key(base, environment))
@@ -87,7 +87,7 @@ def connect(url: str, model: str, timeout: float, environment: Mapping[str, str]
 
 
 def read_url(url: str) -> str:
-    """The base address without a final slash, with /v1 where it has no path."""
+    """Returns the base address without a final slash, with /v1 if it has no path."""
     parts = urllib.parse.SplitResult("", "", "", "", "")
     try:
         parts = urllib.parse.urlsplit(url.strip())
@@ -108,7 +108,8 @@ def read_url(url: str) -> str:
 
 
 def find_key(base: str, environment: Mapping[str, str]) -> str:
-    """GSOPT_LLM_KEY; OPENAI_API_KEY for OpenAI's own hosts alone. UsageError rather than sending it in the clear."""
+    """Returns GSOPT_LLM_KEY, or OPENAI_API_KEY for OpenAI's own hosts. Raises UsageError instead of sending it in
+    clear."""
     parts = urllib.parse.urlsplit(base)
     host = parts.hostname or ""
     key = environment.get(KEY_VARIABLE, "").strip()
@@ -124,21 +125,21 @@ def find_key(base: str, environment: Mapping[str, str]) -> str:
 
 
 def is_local(host: str) -> bool:
-    """Whether the address is this machine."""
+    """True if the address is this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 
 
-def chat(server: Server, body: Mapping[str, Any]) -> Answer:
-    """One completion; a busy server (429, 503, ...) is asked up to TRIES times. Raises Refusal."""
+def chat(server: Server, body: Mapping[str, Any]) -> Completion:
+    """One completion; a busy server (429, 503, ...) is asked up to TRIES times. Raises ServerError."""
     begin = time.monotonic()
-    document = _patiently(lambda: exchange(server, "/chat/completions", {"model": server.model, **body}), server)
+    document = _with_retries(lambda: exchange(server, "/chat/completions", {"model": server.model, **body}), server)
     text, finish = _content(document, server)
-    said = document.get("usage")
-    usage = said if isinstance(said, dict) else {}
-    return Answer(
+    usage = document.get("usage")
+    usage = usage if isinstance(usage, dict) else {}
+    return Completion(
         text=redacted(text, server),
         tokens_in=_count(usage.get("prompt_tokens")),
         tokens_out=_count(usage.get("completion_tokens")),
@@ -147,28 +148,28 @@ def chat(server: Server, body: Mapping[str, Any]) -> Answer:
     )
 
 
-def _patiently(ask: Callable[[], dict[str, Any]], server: Server) -> dict[str, Any]:
-    for attempt in range(TRIES):
+def _with_retries(ask: Callable[[], dict[str, Any]], server: Server) -> dict[str, Any]:
+    for attempt in range(MAX_TRIES):
         try:
             return ask()
-        except Refusal as refusal:
-            wait = min(LONGEST_WAIT, refusal.wait if refusal.wait is not None else 2.0**attempt)
+        except ServerError as refusal:
+            wait = min(MAX_RETRY_WAIT, refusal.wait if refusal.wait is not None else 2.0**attempt)
             over = time.monotonic() + wait >= server.deadline
-            if refusal.status not in BUSY or attempt == TRIES - 1 or over:
+            if refusal.status not in BUSY_STATUSES or attempt == MAX_TRIES - 1 or over:
                 raise
             time.sleep(wait)
     raise AssertionError("the last attempt returns or raises")
 
 
 def _content(document: dict[str, Any], server: Server) -> tuple[str, str]:
-    """The text of the first choice and why it ended; an empty text where the model said nothing."""
+    """Returns the text of the first choice, possibly empty, and its finish reason."""
     choices = document.get("choices")
     choice = choices[0] if isinstance(choices, list) and choices else None
     message = choice.get("message") if isinstance(choice, dict) else None
     if not isinstance(choice, dict) or not isinstance(message, dict):
-        raise Refusal(f"{server.url} answered JSON that is no chat completion: `choices` is missing. {REMEDY}")
+        raise ServerError(f"{server.url} answered JSON that is no chat completion: `choices` is missing. {REMEDY}")
     content = message.get("content")
-    if isinstance(content, list):  # parts, as some servers send them
+    if isinstance(content, list):  # a list of parts, as from some servers
         content = "".join(str(part.get("text", "")) for part in content if isinstance(part, dict))
     return content if isinstance(content, str) else "", printable(str(choice.get("finish_reason")), 40)
 
@@ -178,8 +179,8 @@ def _count(value: Any) -> int | None:
 
 
 def _only_model(server: Server) -> str:
-    """What GET /models lists, if that is one."""
-    document = _patiently(lambda: exchange(server, "/models", None), server)
+    """Returns the model of GET /models if it is the only one."""
+    document = _with_retries(lambda: exchange(server, "/models", None), server)
     rows = document.get("data")
     names = [row.get("id") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     models = [name for name in names if isinstance(name, str) and name]
@@ -190,9 +191,9 @@ def _only_model(server: Server) -> str:
 
 
 def exchange(server: Server, path: str, body: Mapping[str, Any] | None) -> dict[str, Any]:
-    """POST (or GET without a body) and the JSON object that comes back. Raises Refusal.
+    """Sends a POST (a GET without body) and returns the JSON object of the response. Raises ServerError.
 
-    In a thread of its own, so that the deadline holds while a name is looked up or a server sends a byte a minute.
+    Runs in a thread, so that the deadline also holds during name lookup and for a server that sends a byte a minute.
     """
     request = urllib.request.Request(
         server.url + path,
@@ -201,30 +202,30 @@ def exchange(server: Server, path: str, body: Mapping[str, Any] | None) -> dict[
     )
     if server.key:
         request.add_unredirected_header("Authorization", f"Bearer {server.key}")
-    answered: queue.SimpleQueue[bytes | Refusal] = queue.SimpleQueue()
-    threading.Thread(target=lambda: answered.put(_sent(request, server)), daemon=True).start()
+    answered: queue.SimpleQueue[bytes | ServerError] = queue.SimpleQueue()
+    threading.Thread(target=lambda: answered.put(_send(request, server)), daemon=True).start()
     try:
         data = answered.get(timeout=max(0.01, server.deadline - time.monotonic()))
     except queue.Empty:
-        data = Refusal(f"{server.url} did not answer in time. Give it longer with --timeout, or use --llm none.")
-    if isinstance(data, Refusal):
+        data = ServerError(f"{server.url} did not answer in time. Give it longer with --timeout, or use --llm none.")
+    if isinstance(data, ServerError):
         raise data
     return _object(data, server)
 
 
-def _sent(request: urllib.request.Request, server: Server) -> bytes | Refusal:
+def _send(request: urllib.request.Request, server: Server) -> bytes | ServerError:
     local = is_local(urllib.parse.urlsplit(server.url).hostname or "")
     handlers: list[Any] = [_NoRedirect, urllib.request.ProxyHandler({})] if local else [_NoRedirect]
     remaining = max(0.01, server.deadline - time.monotonic())
     try:
         with urllib.request.build_opener(*handlers).open(request, timeout=remaining) as response:
-            return _bounded(response, server)
+            return _read_bounded(response, server)
     except urllib.error.HTTPError as error:
-        return _refused(error, server)
-    except Exception as error:  # whatever the library raises has to reach the thread that waits
+        return _server_error(error, server)
+    except Exception as error:  # any exception must reach the waiting thread
         reason = getattr(error, "reason", None) or error
         text = printable(redacted(str(reason) or type(error).__name__, server), 200)
-        return Refusal(f"No usable answer came from {server.url} ({text}). {REMEDY}")
+        return ServerError(f"No usable answer came from {server.url} ({text}). {REMEDY}")
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
@@ -232,37 +233,41 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         return None
 
 
-def _bounded(response: Any, server: Server) -> bytes | Refusal:
+def _read_bounded(response: Any, server: Server) -> bytes | ServerError:
     data = bytearray()
     while chunk := response.read1(CHUNK):
         data += chunk
-        if len(data) > LARGEST_ANSWER:
-            return Refusal(
-                f"{server.url} answered more than {LARGEST_ANSWER} bytes, which is no list of prompts. {REMEDY}"
+        if len(data) > MAX_RESPONSE_BYTES:
+            return ServerError(
+                f"{server.url} answered more than {MAX_RESPONSE_BYTES} bytes, which is no list of prompts. {REMEDY}"
             )
         if time.monotonic() > server.deadline:
-            return Refusal(f"{server.url} did not finish in time. Give it longer with --timeout, or use --llm none.")
-    if response.length:  # bytes that were announced and never came
-        return Refusal(f"{server.url} broke off in the middle of its answer, after {len(data)} bytes. {REMEDY}")
+            return ServerError(
+                f"{server.url} did not finish in time. Give it longer with --timeout, or use --llm none."
+            )
+    if response.length:  # fewer bytes than announced
+        return ServerError(f"{server.url} broke off in the middle of its answer, after {len(data)} bytes. {REMEDY}")
     return bytes(data)
 
 
-def _refused(error: urllib.error.HTTPError, server: Server) -> Refusal:
-    """A status other than 2xx, with what the server says about it."""
-    said = b""
+def _server_error(error: urllib.error.HTTPError, server: Server) -> ServerError:
+    """Returns the error for a status other than 2xx, with the server's reason."""
+    body = b""
     with contextlib.suppress(OSError, http.client.HTTPException, ValueError):
-        said = error.read(CHUNK)
-    text = printable(redacted(_reason(said), server), 300)
+        body = error.read(CHUNK)
+    text = printable(redacted(_reason(body), server), 300)
     wait = None
     with contextlib.suppress(TypeError, ValueError):
         wait = max(0.0, float(error.headers["Retry-After"]))
-    advice = ADVICE.get(error.code, REMEDY)
-    return Refusal(f"{server.url} answered HTTP {error.code} ({text or 'no reason given'}). {advice}", error.code, wait)
+    advice = STATUS_ADVICE.get(error.code, REMEDY)
+    return ServerError(
+        f"{server.url} answered HTTP {error.code} ({text or 'no reason given'}). {advice}", error.code, wait
+    )
 
 
-def _reason(said: bytes) -> str:
-    """The message of OpenAI's error object, else the text."""
-    text = said.decode("utf-8", "replace")
+def _reason(body: bytes) -> str:
+    """Returns the message of OpenAI's error object, else the text."""
+    text = body.decode("utf-8", "replace")
     try:
         document = json.loads(text)
         error = document.get("error", document) if isinstance(document, dict) else text
@@ -280,9 +285,9 @@ def _object(data: bytes, server: Server) -> dict[str, Any]:
     except (ValueError, RecursionError):
         begin = printable(redacted(data[:200].decode("utf-8", "replace"), server), 60)
         what = f"no JSON ({begin!r})" if data else "nothing"
-    raise Refusal(f"{server.url} answered {what}: it does not speak the OpenAI-compatible protocol. {REMEDY}")
+    raise ServerError(f"{server.url} answered {what}: it does not speak the OpenAI-compatible protocol. {REMEDY}")
 
 
 def redacted(text: str, server: Server) -> str:
-    """Without the key, should the server repeat it."""
+    """Removes the key from text of the server."""
     return text.replace(server.key, "***") if server.key else text

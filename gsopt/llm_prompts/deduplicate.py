@@ -1,35 +1,35 @@
-"""No two prompts that say the same: compared by the words that matter."""
+"""Removes prompts with the same content words as another one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from gsopt.llm_prompts.schema import Prompt
-from gsopt.llm_prompts.subject import content
+from gsopt.llm_prompts.subject import content_words
+from gsopt.sds.prompts import Prompt
 
-ALIKE = 0.8
-"""Share of common words (Jaccard) from which two texts count as one."""
-
-
-def is_like(text: str, other: str) -> bool:
-    """Whether two texts have (almost) the same words, in whatever order and number."""
-    a, b = content(text), content(other)
-    return len(a & b) >= ALIKE * len(a | b)
+MIN_SIMILARITY = 0.8
+"""Jaccard similarity of content words from which two texts count as duplicates."""
 
 
-def repeated(prompt: Prompt, others: Iterable[Prompt]) -> Prompt | None:
-    """The first of the others that says the same with the same polarity and an overlapping view."""
+def is_similar(text: str, other: str) -> bool:
+    """True if two texts have (almost) the same content words, regardless of order and number."""
+    a, b = content_words(text), content_words(other)
+    return len(a & b) >= MIN_SIMILARITY * len(a | b)
+
+
+def find_duplicate(prompt: Prompt, others: Iterable[Prompt]) -> Prompt | None:
+    """Returns the first similar prompt with the same polarity and an overlapping view."""
     for other in others:
         seen_together = "all" in (prompt.view, other.view) or prompt.view == other.view
-        if prompt.polarity == other.polarity and seen_together and is_like(prompt.text, other.text):
+        if prompt.polarity == other.polarity and seen_together and is_similar(prompt.text, other.text):
             return other
     return None
 
 
-def without_repetitions(prompts: Iterable[Prompt]) -> tuple[Prompt, ...]:
-    """The prompts in order, each only if none before it says the same."""
+def without_duplicates(prompts: Iterable[Prompt]) -> tuple[Prompt, ...]:
+    """Returns the prompts in order without duplicates of earlier ones."""
     kept: list[Prompt] = []
     for prompt in prompts:
-        if repeated(prompt, kept) is None:
+        if find_duplicate(prompt, kept) is None:
             kept.append(prompt)
     return tuple(kept)

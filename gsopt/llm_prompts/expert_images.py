@@ -1,4 +1,4 @@
-"""The expert's photos, for models that see and for CLIP: image files, a folder of them, or a dataset's input views."""
+"""Reads the expert's photos for language models and CLIP: image files, a folder of them, or a dataset's input views."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
-LARGEST = 64 << 20
-"""Pixels of an image that is opened."""
-SIDE = 512
-"""Longer side of what is kept, px."""
+MAX_PIXELS = 64 << 20
+"""Size limit of an image, pixels."""
+KEPT_SIDE = 512
+"""Longer side of the images in memory, px."""
 SENT_SIDE = 384
-"""Longer side of what a language model is sent, px."""
-MOST = 8
-MOST_SENT = 4
+"""Longer side of the images sent to a language model, px."""
+MAX_IMAGES = 8
+MAX_SENT_IMAGES = 4
 
 
-def read_views(paths: Sequence[Path], most: int = MOST) -> tuple[Image.Image, ...]:
-    """At most `most` pictures, evenly spread over what the paths name, on white, made small.
+def read_views(paths: Sequence[Path], most: int = MAX_IMAGES) -> tuple[Image.Image, ...]:
+    """Returns at most `most` reduced images on white, evenly spread over the paths.
 
-    Raises InputError for what is no image, too large or not there.
+    Raises InputError for a missing, broken or too large image.
     """
     if len(paths) == 1 and _is_dataset(paths[0]):
         return _input_views(paths[0], most)
@@ -41,21 +41,21 @@ def read_views(paths: Sequence[Path], most: int = MOST) -> tuple[Image.Image, ..
     return tuple(_read(file) for file in files[::step])
 
 
-def to_jpegs(pictures: Sequence[Image.Image]) -> tuple[bytes, ...]:
-    """A few of the pictures as small JPEG files without any metadata."""
-    step = max(1, -(-len(pictures) // MOST_SENT))
-    return tuple(_jpeg(picture) for picture in pictures[::step])
+def to_jpegs(images: Sequence[Image.Image]) -> tuple[bytes, ...]:
+    """Returns a few of the images as small JPEG files without metadata."""
+    step = max(1, -(-len(images) // MAX_SENT_IMAGES))
+    return tuple(_jpeg(image) for image in images[::step])
 
 
-def to_squares(pictures: Sequence[Image.Image], size: int) -> Float[Tensor, "B 3 S S"]:
-    """Their middle squares, 0..1."""
+def to_squares(images: Sequence[Image.Image], size: int) -> Float[Tensor, "B 3 S S"]:
+    """Returns the center squares, 0..1."""
     import torch
 
     squares = []
-    for picture in pictures:
-        side = min(picture.size)
-        left, top = (picture.width - side) // 2, (picture.height - side) // 2
-        square = picture.resize((size, size), Image.Resampling.LANCZOS, (left, top, left + side, top + side))
+    for image in images:
+        side = min(image.size)
+        left, top = (image.width - side) // 2, (image.height - side) // 2
+        square = image.resize((size, size), Image.Resampling.LANCZOS, (left, top, left + side, top + side))
         pixels = torch.frombuffer(bytearray(square.tobytes()), dtype=torch.uint8)
         squares.append(pixels.view(size, size, 3).permute(2, 0, 1) / 255)
     return torch.stack(squares) if squares else torch.empty(0, 3, size, size)
@@ -77,7 +77,7 @@ def _read(path: Path) -> Image.Image:
         if not path.is_file():
             raise OSError("no such file")
         with Image.open(path, formats=FORMATS) as image:
-            if image.width * image.height > LARGEST:
+            if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} px is too large")
             return _on_white(image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -85,13 +85,13 @@ def _read(path: Path) -> Image.Image:
 
 
 def _on_white(rgba: Image.Image) -> Image.Image:
-    picture = Image.alpha_composite(Image.new("RGBA", rgba.size, "white"), rgba).convert("RGB")
-    picture.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
-    return picture
+    image = Image.alpha_composite(Image.new("RGBA", rgba.size, "white"), rgba).convert("RGB")
+    image.thumbnail((KEPT_SIDE, KEPT_SIDE), Image.Resampling.LANCZOS)
+    return image
 
 
-def _jpeg(picture: Image.Image) -> bytes:
-    small = picture.copy()
+def _jpeg(image: Image.Image) -> bytes:
+    small = image.copy()
     small.thumbnail((SENT_SIDE, SENT_SIDE), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
     small.save(buffer, format="JPEG", quality=85)
@@ -104,9 +104,9 @@ def _input_views(folder: Path, most: int) -> tuple[Image.Image, ...]:
 
     views = load_scene(DataConfig(path=str(folder))).train
     step = max(1, -(-len(views) // most))
-    return tuple(_picture(view) for view in views[::step])
+    return tuple(_view_image(view) for view in views[::step])
 
 
-def _picture(view: View) -> Image.Image:
+def _view_image(view: View) -> Image.Image:
     image = Image.fromarray(view.pixels().contiguous().numpy())
     return _on_white(image.convert("RGBA"))

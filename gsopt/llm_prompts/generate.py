@@ -1,4 +1,4 @@
-"""From an expert's notes to a prompts.json: the words as they are, then a language model's prompts or a template's."""
+"""Makes a prompt set from an expert's notes: the notes themselves, then prompts of a language model or a template."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gsopt._optional import require
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, write_atomic
-from gsopt.llm_prompts.deduplicate import without_repetitions
-from gsopt.llm_prompts.expand import Wish, expand, filled_up, own_words
-from gsopt.llm_prompts.schema import LONGEST_NAME, LONGEST_NOTES, MOST_WARNINGS, Made, Prompt, PromptSet
+from gsopt.llm_prompts.deduplicate import without_duplicates
+from gsopt.llm_prompts.expand import PromptSpec, expand, expert_prompt, fill_with_template
 from gsopt.llm_prompts.subject import find_object
 from gsopt.llm_prompts.templates import Template, load_template
-from gsopt.llm_prompts.tokens import LONGEST, Counter, counter_for
+from gsopt.llm_prompts.tokens import MAX_TOKENS, TokenCounter, counter_for
+from gsopt.sds.prompts import MAX_NAME_LENGTH, MAX_NOTES_LENGTH, MAX_WARNINGS, Prompt, PromptSet, Provenance
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     from gsopt.llm_prompts.query import Conversation
     from gsopt.sds.priors.protocol import Encoder
 
-MOST = 64
-"""Prompts that may be asked for."""
-LONGEST_TIMEOUT = 24 * 3600.0
-NOT_SCORED = "the prompts are not scored: the prior has no CLIP that joins words and pictures; give one with --clip"
+MAX_REQUESTED = 64
+"""Largest number of prompts per request."""
+MAX_TIMEOUT = 24 * 3600.0
+NOT_SCORED = "the prompts are not scored: the prior has no CLIP with a joint space of text and images; give --clip"
 
 
 @dataclass(frozen=True)
-class Job:
-    """What is to be made, and how."""
+class PromptJob:
+    """Settings of `gsopt prompts`."""
 
     notes: str
     domain: str = "generic"
@@ -53,48 +53,50 @@ class Job:
 
     def __post_init__(self) -> None:
         if not self.notes.strip():
-            raise UsageError('`--notes` is needed, got nothing. Say what the object is: --notes "worn oak chair".')
-        if len(self.notes) > LONGEST_NOTES:
-            raise UsageError(f"`--notes` may have {LONGEST_NOTES} characters, got {len(self.notes)}. Shorten them.")
-        if len(self.category) > LONGEST_NAME:
-            raise UsageError(f"`--category` may have {LONGEST_NAME} characters, got {len(self.category)}. Shorten it.")
+            raise UsageError('`--notes` is needed, got nothing. Describe the object: --notes "worn oak chair".')
+        if len(self.notes) > MAX_NOTES_LENGTH:
+            raise UsageError(f"`--notes` may have {MAX_NOTES_LENGTH} characters, got {len(self.notes)}. Shorten them.")
+        if len(self.category) > MAX_NAME_LENGTH:
+            raise UsageError(
+                f"`--category` may have {MAX_NAME_LENGTH} characters, got {len(self.category)}. Shorten it."
+            )
         Prompt(" ".join(self.notes.split())[:1000])
-        check.within("-n", self.n, 1, MOST, "8 is usual.")
-        check.within("--negatives", self.negatives, 0, MOST, "0 makes none.")
-        check.within("--timeout", self.timeout, 1.0, LONGEST_TIMEOUT, "It is in seconds; 120 is the default.")
+        check.within("-n", self.n, 1, MAX_REQUESTED, "8 is usual.")
+        check.within("--negatives", self.negatives, 0, MAX_REQUESTED, "0 makes none.")
+        check.within("--timeout", self.timeout, 1.0, MAX_TIMEOUT, "It is in seconds; 120 is the default.")
         check.within("--temperature", self.temperature, 0.0, 2.0, "0.8 is the default.")
         if not self.prior:
             raise UsageError("`--prior` is empty. Give embedded, sd21, a diffusers folder or a hub id.")
 
 
 @dataclass(frozen=True)
-class Result:
-    """Prompts, and what else there is to tell."""
+class PromptResult:
+    """A prompt set with the record of its generation."""
 
     made: PromptSet
     record: dict[str, Any] | None
-    """The conversation with the model; None where there was none."""
-    counter: Counter
-    talk: Conversation | None = None
+    """The conversation with the model, or `None`."""
+    counter: TokenCounter
+    conversation: Conversation | None = None
 
 
-def make_prompts(job: Job, report: Report) -> Result:
+def make_prompts(job: PromptJob, report: Report) -> PromptResult:
     """Prompts for the job. `report` gets the progress.
 
-    Raises UsageError and InputError for a job that cannot be done, Refusal where the model cannot be had and no
+    Raises UsageError and InputError for a job that cannot be done, ServerError where the model cannot be had and no
     fallback to the template is allowed.
     """
     template = load_template(job.domain)
-    wish = Wish(job.notes.strip(), job.category.strip() or find_object(job.notes), job.n, job.negatives)
+    spec = PromptSpec(job.notes.strip(), job.category.strip() or find_object(job.notes), job.n, job.negatives)
     folder = prior_folder(job.prior)
     counter = counter_for(folder)
     views = _views(job)
-    clip = _clip(job.clip) if views and job.clip else None  # before a model is asked, whose answers may cost money
-    own = own_words(wish)
+    clip = _clip(job.clip) if views and job.clip else None  # before the request to a model, which may cost money
+    own = expert_prompt(spec)
     if job.llm == "none":
-        result = Result(_set(job, wish, template, (own, *expand(template, wish, counter))), None, counter)
+        result = PromptResult(_set(job, spec, template, (own, *expand(template, spec, counter))), None, counter)
     else:
-        result = _with_model(job, wish, template, counter, views, report)
+        result = _with_model(job, spec, template, counter, views, report)
     made = result.made
     if views and (clip is not None or (folder is not None and (folder / "text_encoder").is_dir())):
         made = scored(made, clip or _encoder(job.prior), views)
@@ -104,20 +106,20 @@ def make_prompts(job: Job, report: Report) -> Result:
 
 
 def prior_folder(prior: str) -> Path | None:
-    """The folder of a prior, None where it does not lie on this machine. Fetches nothing.
+    """Returns the folder of a prior, or `None` if it is not on this machine. Fetches nothing.
 
-    Raises UsageError for what is neither a folder nor a name that a prior could have.
+    Raises UsageError for an invalid name.
     """
-    from gsopt.sds.select_prior import EMBEDDED, what_embedded_lacks
+    from gsopt.sds.select_prior import EMBEDDED, embedded_prior_obstacle
 
     if prior in ("auto", "embedded"):
-        return EMBEDDED if what_embedded_lacks() is None else None
+        return EMBEDDED if embedded_prior_obstacle() is None else None
     path = Path(prior).expanduser()
     return path if path.is_dir() else _cached(prior)
 
 
 def _cached(prior: str) -> Path | None:
-    """What the hub's client has on this machine."""
+    """Returns the folder in the hub's cache, if any."""
     from gsopt.sds.priors.folder import HUB_ID, SD21
 
     name = SD21 if prior == "sd21" else prior
@@ -129,22 +131,22 @@ def _cached(prior: str) -> Path | None:
         from huggingface_hub import snapshot_download
 
         return Path(snapshot_download(name, local_files_only=True))
-    except Exception:  # not installed, or not in the cache: the estimate does
+    except Exception:  # not installed or not in the cache: use the estimate
         return None
 
 
 def raw_file(output: Path) -> Path:
-    """Where the model's answers are kept, beside the prompts."""
+    """Returns the path of the model's replies, beside the prompts."""
     return output.with_name(f"{output.stem}.raw.json")
 
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
-    """The conversation as JSON in ASCII: whatever the model said, opening the file does nothing to a terminal."""
+    """Writes the conversation as JSON in ASCII, which is safe to print on a terminal whatever the model wrote."""
     write_atomic(path, (json.dumps(record, indent=1, ensure_ascii=True) + "\n").encode("ascii"))
 
 
 def scored(made: PromptSet, clip: tuple[Encoder | None, int], views: Sequence[Image.Image]) -> PromptSet:
-    """With the alignment of the views, seen by an encoder at that size; prompts that say other things are warned of."""
+    """Adds alignment scores with the views, encoded at that size, and warnings about mismatching prompts."""
     import torch
 
     from gsopt.llm_prompts.expert_images import to_squares
@@ -163,7 +165,7 @@ def scored(made: PromptSet, clip: tuple[Encoder | None, int], views: Sequence[Im
 
 
 def _clip(name: str) -> tuple[Encoder, int]:
-    """A CLIP of its own, and the side of its images."""
+    """Loads a separate CLIP; returns it with the side of its images."""
     import torch
 
     from gsopt.sds.priors.clip import ClipEncoder, load_joint_clip
@@ -174,7 +176,7 @@ def _clip(name: str) -> tuple[Encoder, int]:
 
 
 def _encoder(name: str) -> tuple[Encoder | None, int]:
-    """The prior's own."""
+    """Returns the prior's own encoder and image side."""
     from gsopt.sds.load_prior import open_prior
 
     name = "embedded" if name == "auto" else name
@@ -182,7 +184,7 @@ def _encoder(name: str) -> tuple[Encoder | None, int]:
     return prior.encoder(), prior.size
 
 
-def _views(job: Job) -> tuple[Image.Image, ...]:
+def _views(job: PromptJob) -> tuple[Image.Image, ...]:
     if not job.images:
         return ()
     from gsopt.llm_prompts.expert_images import read_views
@@ -191,74 +193,79 @@ def _views(job: Job) -> tuple[Image.Image, ...]:
 
 
 def _with_model(
-    job: Job, wish: Wish, template: Template, counter: Counter, views: Sequence[Image.Image], report: Report
-) -> Result:
-    from gsopt.llm_prompts.client import Refusal, connect
+    job: PromptJob,
+    spec: PromptSpec,
+    template: Template,
+    counter: TokenCounter,
+    views: Sequence[Image.Image],
+    report: Report,
+) -> PromptResult:
+    from gsopt.llm_prompts.client import ServerError, connect
     from gsopt.llm_prompts.expert_images import to_jpegs
-    from gsopt.llm_prompts.query import Request, converse, source_of
+    from gsopt.llm_prompts.query import QuerySettings, converse, source_of
 
     require("pydantic", "llm", "Asking a language model")
-    own = own_words(wish)
+    own = expert_prompt(spec)
     try:
         server = connect(job.llm, job.model, job.timeout)
         source = source_of(server.model)
         report(f"asking {source} at {server.url}, for at most {job.timeout:g} s")
-        request = Request(template, wish, job.temperature, job.seed, to_jpegs(views))
-        talk = converse(server, request, counter, report)
-    except Refusal as refusal:
+        settings = QuerySettings(template, spec, job.temperature, job.seed, to_jpegs(views))
+        conversation = converse(server, settings, counter, report)
+    except ServerError as refusal:
         if not job.fallback:
             raise
         warning = f"{refusal} The prompts are the template's."
-        made = _set(job, wish, template, (own, *expand(template, wish, counter)), warnings=(warning,))
-        return Result(made, None, counter)
+        made = _set(job, spec, template, (own, *expand(template, spec, counter)), warnings=(warning,))
+        return PromptResult(made, None, counter)
     record = {
         "version": 1,
         "url": server.url,
         "model": server.model,
-        "rounds": [asdict(each) for each in talk.rounds],
-        "notes": list(talk.notes),
+        "rounds": [asdict(each) for each in conversation.rounds],
+        "notes": list(conversation.notes),
     }
-    warnings = list(talk.notes)
-    prompts = filled_up(talk.prompts, template, wish, counter)
-    if not talk.prompts:
+    warnings = list(conversation.notes)
+    prompts = fill_with_template(conversation.prompts, template, spec, counter)
+    if not conversation.prompts:
         warnings.insert(0, f"the model {source} gave nothing that can be used")
-    elif len(prompts) > len(talk.prompts):
-        filled = len(prompts) - len(talk.prompts)
-        warnings.insert(0, f"{len(talk.prompts)} prompts are from the model, {filled} from the template")
-    everything = without_repetitions((own, *prompts))
-    return Result(_set(job, wish, template, everything, source, tuple(warnings)), record, counter, talk)
+    elif len(prompts) > len(conversation.prompts):
+        filled = len(prompts) - len(conversation.prompts)
+        warnings.insert(0, f"{len(conversation.prompts)} prompts are from the model, {filled} from the template")
+    everything = without_duplicates((own, *prompts))
+    return PromptResult(_set(job, spec, template, everything, source, tuple(warnings)), record, counter, conversation)
 
 
-def require_model_prompts(result: Result, job: Job, raw: Path) -> None:
-    """InputError where a model was asked, gave nothing, and the template may not stand in for it."""
-    if result.talk is not None and not result.talk.prompts and not job.fallback:
-        reasons = "; ".join(result.talk.notes[:4]) or "no reason known"
+def require_model_prompts(result: PromptResult, job: PromptJob, raw: Path) -> None:
+    """Raises InputError if a model returned no prompt and the job does not allow the template as fallback."""
+    if result.conversation is not None and not result.conversation.prompts and not job.fallback:
+        reasons = "; ".join(result.conversation.notes[:4]) or "no reason known"
         raise InputError(
-            f"The model gave no prompt that can be used after {len(result.talk.rounds)} answers ({reasons}). Its "
-            f"answers are in {raw}. Use a larger model, allow the template to step in with --fallback, or --llm none."
+            f"The model gave no usable prompt after {len(result.conversation.rounds)} answers ({reasons}). "
+            f"Its answers are in {raw}. Use a larger model, allow the template with --fallback, or use --llm none."
         )
 
 
 def _set(
-    job: Job,
-    wish: Wish,
+    job: PromptJob,
+    spec: PromptSpec,
     template: Template,
     prompts: tuple[Prompt, ...],
     source: str = "template",
     warnings: tuple[str, ...] = (),
 ) -> PromptSet:
-    made = Made(source=source, template=template.name)
-    everything = PromptSet(prompts, notes=job.notes.strip(), object=wish.object, domain=template.name, made=made)
+    made = Provenance(source=source, template=template.name)
+    everything = PromptSet(prompts, notes=job.notes.strip(), object=spec.object, domain=template.name, made=made)
     return replace(everything, made=_warned(everything, warnings))
 
 
-def _warned(made: PromptSet, warnings: Sequence[str]) -> Made:
-    before = made.made or Made()
-    return replace(before, warnings=tuple(dict.fromkeys((*before.warnings, *warnings)))[:MOST_WARNINGS])
+def _warned(made: PromptSet, warnings: Sequence[str]) -> Provenance:
+    before = made.made or Provenance()
+    return replace(before, warnings=tuple(dict.fromkeys((*before.warnings, *warnings)))[:MAX_WARNINGS])
 
 
-def _too_long(prompts: Sequence[Prompt], counter: Counter) -> tuple[str, ...]:
-    longest = min(LONGEST, counter.longest)
+def _too_long(prompts: Sequence[Prompt], counter: TokenCounter) -> tuple[str, ...]:
+    longest = min(MAX_TOKENS, counter.max_tokens)
     return tuple(
         f"the prompt {prompt.text[:60]!r} has {count} tokens by {counter.name}; {longest} are read"
         for prompt in prompts

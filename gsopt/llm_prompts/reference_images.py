@@ -1,6 +1,6 @@
 """Reference images from prompts, by the text-to-image pipeline of a Stable Diffusion prior.
 
-They show what the model takes the words for, not the object: nothing uses them before the expert has accepted them.
+They show the model's reading of the prompts, not the object: guidance uses only those that the expert accepted.
 """
 
 from __future__ import annotations
@@ -17,50 +17,50 @@ from gsopt._optional import require
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import UsageError
 from gsopt.events import Report, write_atomic
-from gsopt.llm_prompts.schema import MOST_IMAGES, Picture, Prompt
+from gsopt.sds.prompts import MAX_IMAGES, Prompt, ReferenceImage
 
 if TYPE_CHECKING:
     from PIL import Image
 
     from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
-MOST_STEPS = 1000
+MAX_STEPS = 1000
 PAGE = "index.html"
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """How pictures are made."""
+class ImageSettings:
+    """Settings of the image generation."""
 
     count: int
-    """K: one picture per prompt, in turn, each with a seed of its own."""
+    """Number of images, for the prompts in turn, each with its own seed."""
     seed: int = 0
     steps: int = 25
     guidance_scale: float = 7.5
 
     def __post_init__(self) -> None:
-        check.within("--images-from-prompts", self.count, 0, MOST_IMAGES, "4 is usual, 0 makes none.")
-        check.within("--image-steps", self.steps, 1, MOST_STEPS, "25 is the default.")
+        check.within("--images-from-prompts", self.count, 0, MAX_IMAGES, "4 is usual, 0 makes none.")
+        check.within("--image-steps", self.steps, 1, MAX_STEPS, "25 is the default.")
 
 
-def cannot_draw(prior: str) -> str | None:
-    """Why this prior makes no pictures from words; None where nothing speaks against it. No torch."""
+def no_images_reason(prior: str) -> str | None:
+    """Returns the reason why this prior generates no images, or `None`. No torch."""
     if prior in ("auto", "embedded"):
         return (
-            "the embedded prior repairs views of a scene and makes no pictures from words alone; name a Stable "
+            "the embedded prior repairs views of a scene and generates no images from text alone; name a Stable "
             "Diffusion model: --prior sd21 or a diffusers folder"
         )
     return None
 
 
-def illustrate(
-    prior_name: str, prompts: Sequence[Prompt], drawing: Drawing, folder: Path, report: Report
-) -> tuple[tuple[Picture, ...], str | None]:
-    """Pictures written to `folder` (none accepted), or the reason why this prior makes none.
+def generate_images(
+    prior_name: str, prompts: Sequence[Prompt], settings: ImageSettings, folder: Path, report: Report
+) -> tuple[tuple[ReferenceImage, ...], str | None]:
+    """Writes images to `folder` (none accepted) and returns them, or the reason why this prior generates none.
 
-    Raises InputError for a prior that is missing or broken, UsageError where there is nothing to draw.
+    Raises InputError for a missing or broken prior, UsageError without positive prompts.
     """
-    reason = cannot_draw(prior_name)
+    reason = no_images_reason(prior_name)
     if reason is not None:
         return (), reason
     wanted = [prompt for prompt in prompts if prompt.polarity == "positive" and prompt.weight > 0]
@@ -71,25 +71,25 @@ def illustrate(
         return (), reason
     negative = ", ".join(p.text for p in prompts if p.polarity == "negative" and p.weight > 0)
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = []
+    images = []
     pipeline = _pipeline(prior)
-    for number in range(drawing.count):
+    for number in range(settings.count):
         prompt = wanted[number % len(wanted)]
-        report(f"picture {number + 1} of {drawing.count}: {prompt.text}")
-        image = _draw(pipeline, prior.size, prompt, negative, drawing, number)
+        report(f"picture {number + 1} of {settings.count}: {prompt.text}")
+        image = _draw(pipeline, prior.size, prompt, negative, settings, number)
         name = _free_name(folder)
         write_atomic(folder / name, _png(image))
-        pictures.append(Picture(f"{folder.name}/{name}", prompt.text, prior.folder.name[-200:]))
-    write_atomic(folder / PAGE, contact_sheet(pictures).encode())
-    return tuple(pictures), None
+        images.append(ReferenceImage(f"{folder.name}/{name}", prompt.text, prior.folder.name[-200:]))
+    write_atomic(folder / PAGE, contact_sheet(images).encode())
+    return tuple(images), None
 
 
-def contact_sheet(pictures: Sequence[Picture]) -> str:
-    """A page that shows the pictures with their prompts; it lies beside them and loads nothing else."""
+def contact_sheet(images: Sequence[ReferenceImage]) -> str:
+    """Returns a page of the images with their prompts, which loads nothing else."""
     figures = "".join(
-        f'<figure><img src="{escape(Path(picture.file).name)}" alt="" width="320"><figcaption>'
-        f"{escape(Path(picture.file).name)}: {escape(picture.prompt)}</figcaption></figure>"
-        for picture in pictures
+        f'<figure><img src="{escape(Path(image.file).name)}" alt="" width="320"><figcaption>'
+        f"{escape(Path(image.file).name)}: {escape(image.prompt)}</figcaption></figure>"
+        for image in images
     )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" '
@@ -108,18 +108,18 @@ def _open(name: str) -> tuple[DiffusersPrior | None, str | None]:
     if not isinstance(prior, DiffusersPrior) or not prior.folder.takes_text:
         return (
             None,
-            f"the prior {name} takes no words; name a Stable Diffusion model: --prior sd21 or a diffusers folder",
+            f"the prior {name} takes no text; name a Stable Diffusion model: --prior sd21 or a diffusers folder",
         )
     if prior.class_embedding_width is not None:
         return (
             None,
-            f"the prior {name} wants an image beside the words (unCLIP); name a text-to-image model: --prior sd21",
+            f"the prior {name} needs an image beside the text (unCLIP); name a text-to-image model: --prior sd21",
         )
     return prior, None
 
 
 def _pipeline(prior: DiffusersPrior) -> Any:
-    """diffusers' own pipeline, of parts that were checked one by one: model_index.json never names code to run."""
+    """Builds diffusers' pipeline from individually checked parts: model_index.json never names code to run."""
     from gsopt.sds.priors import clip
 
     diffusers = require("diffusers", "sds", "Pictures from prompts")
@@ -139,26 +139,26 @@ def _pipeline(prior: DiffusersPrior) -> Any:
     return pipeline
 
 
-def _draw(pipeline: Any, size: int, prompt: Prompt, negative: str, drawing: Drawing, number: int) -> Image.Image:
-    """One picture; same seed, same picture."""
+def _draw(pipeline: Any, size: int, prompt: Prompt, negative: str, settings: ImageSettings, number: int) -> Image.Image:
+    """Generates one image; same seed, same image."""
     import torch
 
-    from gsopt.sds.conditioning import worded
+    from gsopt.sds.conditioning import with_view_word
 
     image: Image.Image = pipeline(
-        prompt=worded(prompt, "" if prompt.view == "all" else prompt.view),
+        prompt=with_view_word(prompt, "" if prompt.view == "all" else prompt.view),
         negative_prompt=negative or None,
         height=size,
         width=size,
-        num_inference_steps=drawing.steps,
-        guidance_scale=drawing.guidance_scale,
-        generator=torch.Generator("cpu").manual_seed(drawing.seed + number),
+        num_inference_steps=settings.steps,
+        guidance_scale=settings.guidance_scale,
+        generator=torch.Generator("cpu").manual_seed(settings.seed + number),
     ).images[0]
     return image
 
 
 def _free_name(folder: Path) -> str:
-    """The first number that is not taken: pictures of an earlier call are never overwritten."""
+    """Returns the first free number: images of an earlier call are never overwritten."""
     return next(name for n in range(1, 10_000) if not (folder / (name := f"{n:03d}.png")).exists())
 
 

@@ -1,8 +1,8 @@
-"""From a model's answer to prompts: the first JSON that is a reply, its entries validated one by one, the rest named.
+"""Parses prompts from a model's reply: the first valid JSON, its entries validated one by one, rejected ones reported.
 
-Asked for: {"all": [{"text": "...", "why": "..."}], "front": [...], ..., "negative": [...]}. The place in the object
-decides view and polarity; the model's words never do. Plain strings for entries, a bare list and a numbered list in
-prose are taken as well: small models answer so.
+Requested: {"all": [{"text": "...", "why": "..."}], "front": [...], ..., "negative": [...]}. The position in the object
+determines view and polarity, never the text. Plain strings as entries, a bare list and a numbered list in prose, which
+small models write, are accepted as well.
 """
 
 from __future__ import annotations
@@ -14,46 +14,46 @@ from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from gsopt._optional import require
-from gsopt.llm_prompts.deduplicate import repeated
-from gsopt.llm_prompts.expand import Wish
-from gsopt.llm_prompts.sanitize import OTHER_VIEW, Unusable, cleaned, cleaned_rationale
-from gsopt.llm_prompts.schema import Prompt, View
-from gsopt.llm_prompts.subject import names
-from gsopt.llm_prompts.tokens import LONGEST, Counter
+from gsopt.llm_prompts.deduplicate import find_duplicate
+from gsopt.llm_prompts.expand import PromptSpec
+from gsopt.llm_prompts.sanitize import OTHER_VIEW, UnusableText, cleaned, cleaned_rationale
+from gsopt.llm_prompts.subject import names_object
+from gsopt.llm_prompts.tokens import MAX_TOKENS, TokenCounter
+from gsopt.sds.prompts import Prompt, View
 
-LONGEST_ANSWER = 200_000
-"""Characters of an answer that are looked at."""
-MOST_STARTS = 200
-"""Places where JSON may begin that are tried."""
-MOST_DOCUMENTS = 8
-MOST_ENTRIES = 64
-"""Per list of a reply."""
-MOST_PROBLEMS = 12
+MAX_REPLY_CHARACTERS = 200_000
+"""Characters of a reply that are parsed."""
+MAX_JSON_STARTS = 200
+"""Number of possible beginnings of JSON to try."""
+MAX_DOCUMENTS = 8
+MAX_ENTRIES = 64
+"""Limit per list of a reply."""
+MAX_PROBLEMS = 12
 START = re.compile(r"[{\[]")
 LISTED = re.compile(r"^[^\S\n]*(?:[-*\u2022]|\(?\d{1,3}[.):])[^\S\n]+(\S.*)$", re.M)
 THOUGHT = re.compile(r"\A.*</think(?:ing)?>", re.S)
 WHOLE_LIST = ("prompts", "descriptions", "all")
-"""Keys under which models put what belongs under `all`."""
+"""Keys that models use instead of `all`."""
 
 
 class Entry(Protocol):
-    """One entry of a reply, validated."""
+    """One validated entry of a reply."""
 
     text: str
     why: str
 
 
 @dataclass(frozen=True)
-class Read:
-    """What an answer was good for."""
+class ParsedReply:
+    """Prompts and problems of a reply."""
 
     prompts: tuple[Prompt, ...]
     problems: tuple[str, ...]
-    """What was refused and why, in our own words: fit to be sent back and shown."""
+    """Rejected entries with reasons, without text of the model: safe to send and display."""
 
 
 def reply_schema(slots: Mapping[str, int]) -> dict[str, Any]:
-    """JSON Schema of the reply, in the strict subset that servers enforce (every key required, no other allowed)."""
+    """Returns the JSON Schema of the reply, in the strict subset that servers enforce (exactly the listed keys)."""
     entry = {
         "type": "object",
         "properties": {"text": {"type": "string"}, "why": {"type": "string"}},
@@ -64,48 +64,52 @@ def reply_schema(slots: Mapping[str, int]) -> dict[str, Any]:
     return {"type": "object", "properties": lists, "required": list(lists), "additionalProperties": False}
 
 
-def read_reply(answer: str, wish: Wish, source: str, counter: Counter, kept: tuple[Prompt, ...]) -> Read:
-    """Prompts that say something new beside those `kept`, from the first JSON of the answer that has any.
+def read_reply(
+    answer: str, spec: PromptSpec, source: str, counter: TokenCounter, kept: tuple[Prompt, ...]
+) -> ParsedReply:
+    """Returns prompts that differ from those `kept`, from the first JSON of the reply that has any.
 
-    Whatever the answer is: this only returns.
+    Never raises, whatever the reply.
     """
-    reads = [_read(document, wish, source, counter, kept) for document in _documents(answer, wish.slots)]
+    reads = [_read(document, spec, source, counter, kept) for document in _documents(answer, spec.slots)]
     if not reads:
-        return Read((), ("the answer holds no JSON object" if answer.strip() else "the answer was empty",))
+        return ParsedReply((), ("the answer holds no JSON object" if answer.strip() else "the answer was empty",))
     return next((read for read in reads if read.prompts), reads[0])
 
 
-def _read(document: dict[str, Any], wish: Wish, source: str, counter: Counter, kept: tuple[Prompt, ...]) -> Read:
+def _read(
+    document: dict[str, Any], spec: PromptSpec, source: str, counter: TokenCounter, kept: tuple[Prompt, ...]
+) -> ParsedReply:
     prompts: list[Prompt] = []
     problems: list[str] = []
-    for slot, entry in _entries(document, wish.slots, problems):
+    for slot, entry in _entries(document, spec.slots, problems):
         try:
-            prompt = _prompt(slot, entry, wish, source, counter)
-            twin = repeated(prompt, [*kept, *prompts])
-            if twin is not None:
-                raise Unusable(f'it repeats "{twin.text[:60]}"')
+            prompt = _prompt(slot, entry, spec, source, counter)
+            duplicate = find_duplicate(prompt, [*kept, *prompts])
+            if duplicate is not None:
+                raise UnusableText(f'it repeats "{duplicate.text[:60]}"')
             prompts.append(prompt)
-        except Unusable as reason:
+        except UnusableText as reason:
             problems.append(f"one entry of `{slot}` was refused: {reason}")
     if not prompts and not problems:
         problems.append("the lists are empty")
-    return Read(tuple(prompts), tuple(dict.fromkeys(problems))[:MOST_PROBLEMS])
+    return ParsedReply(tuple(prompts), tuple(dict.fromkeys(problems))[:MAX_PROBLEMS])
 
 
 def _documents(answer: str, slots: Mapping[str, int]) -> list[dict[str, Any]]:
-    """JSON values that look like a reply, else all objects, else a list in prose."""
-    text = THOUGHT.sub("", answer[:LONGEST_ANSWER])
-    objects = [value if isinstance(value, dict) else {"all": value} for value in _json_values(text)][:MOST_DOCUMENTS]
+    """Returns JSON values in the format of a reply, else all objects, else a list in prose."""
+    text = THOUGHT.sub("", answer[:MAX_REPLY_CHARACTERS])
+    objects = [value if isinstance(value, dict) else {"all": value} for value in _json_values(text)][:MAX_DOCUMENTS]
     likely = [d for d in objects if any(isinstance(d.get(key), (list, str, dict)) for key in (*slots, *WHOLE_LIST))]
     listed = LISTED.findall(text)
     return likely or objects or ([{"all": listed}] if listed else [])
 
 
 def _json_values(text: str) -> Iterator[Any]:
-    """Objects, and lists of texts or objects, that are not empty, from left to right, not those inside another."""
+    """Yields the outermost nonempty objects and lists of texts or objects, from left to right."""
     decoder = json.JSONDecoder()
     place = 0
-    for _ in range(MOST_STARTS):
+    for _ in range(MAX_JSON_STARTS):
         start = START.search(text, place)
         if start is None:
             return
@@ -119,7 +123,7 @@ def _json_values(text: str) -> Iterator[Any]:
 
 
 def _entries(document: dict[str, Any], slots: Mapping[str, int], problems: list[str]) -> Iterator[tuple[str, Entry]]:
-    """(slot, entry) of every list that was asked for."""
+    """Yields (slot, entry) of every requested list."""
     found = False
     for slot, count in slots.items():
         rows = document.get(slot)
@@ -128,7 +132,7 @@ def _entries(document: dict[str, Any], slots: Mapping[str, int], problems: list[
         if rows is None or not count:
             continue
         found = True
-        for row in (rows if isinstance(rows, list) else [rows])[:MOST_ENTRIES]:
+        for row in (rows if isinstance(rows, list) else [rows])[:MAX_ENTRIES]:
             entry = validated(row)
             if isinstance(entry, str):
                 problems.append(f"one entry of `{slot}` was refused: {entry}")
@@ -139,8 +143,8 @@ def _entries(document: dict[str, Any], slots: Mapping[str, int], problems: list[
 
 
 def validated(row: Any) -> Entry | str:
-    """An entry of the schema, or what is wrong with it."""
-    pydantic = require("pydantic", "llm", "Checking what a language model answers")
+    """Returns an entry of the schema, or its error."""
+    pydantic = require("pydantic", "llm", "Checking a language model's reply")
     values = {"text": row} if isinstance(row, str) else row
     try:
         return cast(Entry, _entry_model().model_validate(values))
@@ -155,16 +159,16 @@ def _entry_model() -> Any:
     return EntryModel
 
 
-def _prompt(slot: str, entry: Entry, wish: Wish, source: str, counter: Counter) -> Prompt:
-    """Raises Unusable."""
+def _prompt(slot: str, entry: Entry, spec: PromptSpec, source: str, counter: TokenCounter) -> Prompt:
+    """Raises UnusableText."""
     negative = slot == "negative"
-    text = cleaned(entry.text, fewest_words=1 if negative else 3)
-    if not negative and not names(text, wish.object):
-        raise Unusable(f'it does not name the object "{wish.object}"')
+    text = cleaned(entry.text, min_words=1 if negative else 3)
+    if not negative and not names_object(text, spec.object):
+        raise UnusableText(f'it does not name the object "{spec.object}"')
     if OTHER_VIEW.search(text):
-        raise Unusable("it speaks of a camera view, which is added later")
-    if counter.count(text) > LONGEST:
-        raise Unusable(f"it has {counter.count(text)} CLIP tokens, more than {LONGEST}")
+        raise UnusableText("it names a camera view, which is added later")
+    if counter.count(text) > MAX_TOKENS:
+        raise UnusableText(f"it has {counter.count(text)} CLIP tokens, more than {MAX_TOKENS}")
     why = cleaned_rationale(entry.why)
     if negative:
         return Prompt(text, polarity="negative", source=source, rationale=why)

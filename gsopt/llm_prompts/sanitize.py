@@ -1,7 +1,7 @@
-"""What a language model wrote, made fit to be a prompt, or refused with the reason. Its text is only ever data.
+"""Sanitizes a language model's text as a prompt, or rejects it with the reason. The text is never more than data.
 
-Mended: white space, quotes around the whole, list marks, Markdown emphasis, a final period, a view at the end.
-Refused: control, invisible and private characters, markup, links, paths, code, slots, talk about instructions.
+Repaired: white space, quotes around the whole, list marks, Markdown emphasis, a final period, a view at the end.
+Rejected: control, invisible and private characters, markup, links, paths, code, slots, talk about instructions.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import re
 import unicodedata
 
-LONGEST_WORDS = 40
-FEWEST_WORDS = 3
-LONGEST_CHARACTERS = 400
-"""Of a description before it is looked at: 40 words are far fewer."""
-LONGEST_RATIONALE = 300
+MAX_WORDS = 40
+MIN_WORDS = 3
+MAX_CHARACTERS = 400
+"""Length limit of a description before parsing; 40 words are far shorter."""
+MAX_RATIONALE_LENGTH = 300
 
 BAD_CATEGORIES = ("Cc", "Cf", "Cs", "Co", "Cn")
-"""Control, invisible (zero width, direction), surrogate, private, unassigned."""
+"""Unicode categories: control, invisible (zero width, direction), surrogate, private, unassigned."""
 EDGES = " \t\"'\u201c\u201d\u2018\u2019\u00ab\u00bb*_"
 STOPS = ".;,: "
 MARK = re.compile(r"^(?:[-*\u2022]|\(?\d{1,3}[.):])\s+")
@@ -46,46 +46,47 @@ OTHER_VIEW = re.compile(
 )
 
 
-class Unusable(Exception):
-    """A text that cannot be mended; the message is the reason, in our own words. It never leaves this package."""
+class UnusableText(Exception):
+    """A text that cannot be repaired; the message is the reason, without text of the model. Internal to this
+    package."""
 
 
-def cleaned(text: str, fewest_words: int = FEWEST_WORDS) -> str:
-    """One clean line. Raises Unusable."""
-    text = plain(text, LONGEST_CHARACTERS)
+def cleaned(text: str, min_words: int = MIN_WORDS) -> str:
+    """Returns one clean line. Raises UnusableText."""
+    text = plain(text, MAX_CHARACTERS)
     text = MARK.sub("", text).strip(EDGES).rstrip(STOPS).strip(EDGES)
     text = VIEW_END.sub("", text).rstrip(STOPS).strip(EDGES)
     words = len(text.split())
-    if not fewest_words <= words <= LONGEST_WORDS:
-        raise Unusable(f"it has {words} words instead of {fewest_words} to {LONGEST_WORDS}")
+    if not min_words <= words <= MAX_WORDS:
+        raise UnusableText(f"it has {words} words instead of {min_words} to {MAX_WORDS}")
     return text
 
 
 def plain(text: str, longest: int) -> str:
-    """One line without anything that could be more than words. Raises Unusable."""
+    """Returns one line of plain words. Raises UnusableText for any other content."""
     if len(text) > longest:
-        raise Unusable(f"it has {len(text)} characters, more than {longest}")
+        raise UnusableText(f"it has {len(text)} characters, more than {longest}")
     text = unicodedata.normalize("NFKC", text)
     text = re.sub(r"\s+", " ", text).strip().replace("**", "").replace("__", "")
     bad = next((c for c in text if unicodedata.category(c) in BAD_CATEGORIES), None)
     if bad is not None:
-        raise Unusable(f"it holds the character U+{ord(bad):04X}")
+        raise UnusableText(f"it holds the character U+{ord(bad):04X}")
     for name, pattern in REFUSED:
         if pattern.search(text):
-            raise Unusable(f"it holds {name}")
+            raise UnusableText(f"it holds {name}")
     return text
 
 
 def cleaned_rationale(text: str) -> str:
-    """Why the model wrote something: one clean line, empty where it cannot be had."""
+    """Returns the model's reason as one clean line, empty if unusable."""
     try:
-        return plain(text[:LONGEST_RATIONALE], LONGEST_RATIONALE)
-    except Unusable:
+        return plain(text[:MAX_RATIONALE_LENGTH], MAX_RATIONALE_LENGTH)
+    except UnusableText:
         return ""
 
 
 def printable(text: str, longest: int) -> str:
-    """Untrusted text for an error message or a terminal: one bounded line, nothing that moves the cursor."""
+    """Returns untrusted text as one bounded line, safe for a terminal."""
     text = re.sub(r"\s+", " ", text[: 4 * longest])
     text = "".join(c for c in text if unicodedata.category(c) not in BAD_CATEGORIES).strip()
     return text if len(text) <= longest else text[: longest - 1] + "\u2026"

@@ -1,11 +1,11 @@
-"""The noun of an object, as far as rules of thumb find it in an expert's notes, and whether a text keeps it."""
+"""Finds the noun of an object in an expert's notes by rules of thumb, and checks that a text contains it."""
 
 from __future__ import annotations
 
 import re
 
 from gsopt.errors import UsageError
-from gsopt.llm_prompts.schema import LONGEST_NAME
+from gsopt.sds.prompts import MAX_NAME_LENGTH
 
 WORD = re.compile(r"[^\W_]+(?:[-'][^\W_]+)*")
 _AFTER = """with without of from in on at for by made having standing lying that which who whose and or near under above
@@ -14,14 +14,15 @@ _LITTLE = """a an the this that these those its his her their my our your of wit
 are was were it be been has have one some any very"""
 AFTER_THE_NOUN = frozenset(_AFTER.split())
 """The noun of a phrase stands before the first of these: "a chair with one broken arm", "a stone from a river"."""
-LITTLE = frozenset(_LITTLE.split())
-"""Words that say nothing about what a text is about."""
+STOP_WORDS = frozenset(_LITTLE.split())
+"""Words without content."""
 
 
 def find_object(notes: str) -> str:
-    """The noun: the last word of the first phrase, before any preposition. "worn oak chair, one arm broken" -> chair.
+    """Returns the noun: the last word of the first phrase, before any preposition. "worn oak chair, one arm broken" ->
+    chair.
 
-    Raises UsageError where no word is left; `--category` says it then.
+    Raises UsageError if no word is left; `--category` gives the noun then.
     """
     first = re.split(r"[,.;:!?()\n]", notes.strip(), maxsplit=1)[0]
     words = [word.lower() for word in WORD.findall(first)]
@@ -29,20 +30,20 @@ def find_object(notes: str) -> str:
     for word in words:
         if word in AFTER_THE_NOUN and phrase:
             break
-        if word not in LITTLE and not word.isdigit():
+        if word not in STOP_WORDS and not word.isdigit():
             phrase.append(word)
     if not phrase:
         raise UsageError(
             f"No object was found in the notes, got {notes[:60]!r}. Begin them with the object, or name it with "
             "--category."
         )
-    return phrase[-1][:LONGEST_NAME]
+    return phrase[-1][:MAX_NAME_LENGTH]
 
 
-def names(text: str, noun: str) -> bool:
-    """Whether the text keeps the noun, singular or plural."""
+def names_object(text: str, noun: str) -> bool:
+    """True if the text contains the noun, singular or plural."""
     said = {stem(word) for word in WORD.findall(text.lower())}
-    return {stem(word) for word in WORD.findall(noun.lower()) if word not in LITTLE} <= said
+    return {stem(word) for word in WORD.findall(noun.lower()) if word not in STOP_WORDS} <= said
 
 
 def stem(word: str) -> str:
@@ -54,8 +55,8 @@ def stem(word: str) -> str:
 
 
 def with_article(noun: str) -> str:
-    """a chair, an urn; a plural stays as it is."""
-    if noun.split()[0].lower() in LITTLE:
+    """Returns a chair, an urn; leaves plurals unchanged."""
+    if noun.split()[0].lower() in STOP_WORDS:
         return noun
     last = noun.lower().split()[-1]
     if stem(last) != last:
@@ -63,6 +64,6 @@ def with_article(noun: str) -> str:
     return f"{'an' if noun[0].lower() in 'aeiou' else 'a'} {noun}"
 
 
-def content(text: str) -> frozenset[str]:
-    """The words that matter, without number and order."""
-    return frozenset(stem(word) for word in WORD.findall(text.lower()) if word not in LITTLE)
+def content_words(text: str) -> frozenset[str]:
+    """Returns the content words, without number and order."""
+    return frozenset(stem(word) for word in WORD.findall(text.lower()) if word not in STOP_WORDS)

@@ -5,13 +5,13 @@
     title: medicine and anatomy
     extends: generic
     ---
-    # System        text: who the language model is
-    # Task          text: what it is asked
+    # System        text: the role of the language model
+    # Task          text: its task
     # Questions     lists, one entry per line that begins with "- "
-    # Words         - femur @back => what is said where the notes have that word (for one view only)
+    # Words         - femur @back => description used if the notes have that word (for one view only)
 
-Lists of a template stand before those it extends, texts replace them. Slots in braces are filled by plain replacement;
-what they hold is never read as a slot again.
+Lists of a template precede those it extends, texts replace them. Slots in braces are filled by plain replacement,
+without recursion.
 """
 
 from __future__ import annotations
@@ -23,46 +23,46 @@ from pathlib import Path
 from typing import get_args
 
 from gsopt.errors import InputError, UsageError
-from gsopt.llm_prompts.schema import View
+from gsopt.sds.prompts import View
 
 FOLDER = Path(__file__).with_name("templates")
 DOMAINS = ("generic", "medicine", "robotics", "arvr", "environment")
-LARGEST_FILE = 256 << 10
+MAX_FILE_BYTES = 256 << 10
 KEYS = ("name", "title", "extends")
 TEXTS = ("system", "task")
 LISTS = ("phrases", "front", "side", "back", "top", "negative", "questions", "rewriting")
 SECTIONS = (*TEXTS, *LISTS, "words")
 SLOT = re.compile(r"\{([a-z_]+)\}")
-FILLED = ("notes", "object", "a_object")
-TASK_SLOTS = (*FILLED, "domain", "questions", "rewriting", "reply", "wanted")
+COMMON_SLOTS = ("notes", "object", "a_object")
+TASK_SLOTS = (*COMMON_SLOTS, "domain", "questions", "rewriting", "reply", "wanted")
 NAME = re.compile(r"[\w .-]{1,60}")
 
 
 @dataclass(frozen=True)
 class Word:
-    """What is known about a word of the notes."""
+    """A description for words of the notes."""
 
     words: tuple[str, ...]
-    """Lower case; any of them."""
+    """Alternative words, lower case."""
     view: View
     description: str
 
 
 @dataclass(frozen=True)
 class Template:
-    """A domain's questions, phrases and knowledge."""
+    """Questions, phrases and word descriptions of a domain."""
 
     name: str
     title: str
     system: str
     task: str
     lists: Mapping[str, tuple[str, ...]]
-    """By section, see LISTS."""
+    """Lists by section, see LISTS."""
     words: tuple[Word, ...]
 
 
 def load_template(domain: str) -> Template:
-    """The template of a domain, or of a file. Raises UsageError for an unknown name, InputError for a broken file."""
+    """Loads the template of a domain or a file. Raises UsageError for an unknown name, InputError for a broken file."""
     if domain in DOMAINS:
         return _merged(FOLDER / f"{domain}.md")
     path = Path(domain).expanduser()
@@ -74,13 +74,13 @@ def load_template(domain: str) -> Template:
 
 
 def fill(text: str, values: Mapping[str, str]) -> str:
-    """The text with its slots filled, in one pass."""
+    """Fills the slots of the text in one pass."""
     return SLOT.sub(lambda slot: values.get(slot[1], slot[0]), text)
 
 
 @dataclass(frozen=True)
 class _File:
-    """One file, before it is merged with what it extends."""
+    """One file, before merging with the one it extends."""
 
     head: dict[str, str]
     texts: dict[str, str]
@@ -113,9 +113,9 @@ def _merged(path: Path) -> Template:
 def _read(path: Path) -> _File:
     try:
         with open(path, "rb") as file:
-            data = file.read(LARGEST_FILE + 1)
-        if len(data) > LARGEST_FILE:
-            raise ValueError(f"larger than {LARGEST_FILE} bytes")
+            data = file.read(MAX_FILE_BYTES + 1)
+        if len(data) > MAX_FILE_BYTES:
+            raise ValueError(f"larger than {MAX_FILE_BYTES} bytes")
         text = data.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(f"Cannot read the template {path}: {error}. Give a Markdown file.") from error
@@ -133,7 +133,7 @@ def _read(path: Path) -> _File:
 
 
 def _head(lines: list[str], path: Path) -> dict[str, str]:
-    """`key: value` per line."""
+    """Parses `key: value` per line."""
     head = {}
     for line in lines:
         key, colon, value = line.partition(":")
@@ -149,7 +149,7 @@ def _head(lines: list[str], path: Path) -> dict[str, str]:
 
 
 def _sections(lines: list[str], path: Path) -> dict[str, list[str]]:
-    """Lines below each `# Heading`; what stands before the first is a comment."""
+    """Returns the lines below each `# Heading`; text before the first is a comment."""
     sections: dict[str, list[str]] = {}
     current: list[str] = []
     for line in lines:
@@ -166,12 +166,12 @@ def _sections(lines: list[str], path: Path) -> dict[str, list[str]]:
 
 def _text(lines: list[str], name: str, path: Path) -> str:
     text = "\n".join(lines).strip()
-    _require_slots(text, TASK_SLOTS if name == "task" else FILLED, path)
+    _require_slots(text, TASK_SLOTS if name == "task" else COMMON_SLOTS, path)
     return text
 
 
 def _list(lines: list[str], name: str, path: Path) -> tuple[str, ...]:
-    """One entry per line that begins with a dash; continued lines are indented."""
+    """Returns one entry per line that begins with a dash; continuation lines are indented."""
     entries: list[str] = []
     for line in lines:
         if line.startswith("- "):
@@ -181,7 +181,7 @@ def _list(lines: list[str], name: str, path: Path) -> tuple[str, ...]:
         elif line.strip():
             raise InputError(f"{path}: section {name.title()} is a list, got {line!r:.80}. Begin the line with a dash.")
     for entry in entries:
-        _require_slots(entry, FILLED, path)
+        _require_slots(entry, COMMON_SLOTS, path)
     return tuple(entries)
 
 
@@ -192,13 +192,13 @@ def _require_slots(text: str, known: tuple[str, ...], path: Path) -> None:
 
 
 def _word(entry: str, path: Path) -> Word:
-    """`femur, thigh bone @back => ...`"""
+    """Parses `femur, thigh bone @back => ...`."""
     left, arrow, description = entry.partition("=>")
     names, _, view = left.partition("@")
     words = tuple(word.strip().lower() for word in names.split(",") if word.strip())
     place = view.strip() or "all"
     if not arrow or not words or not description.strip() or place not in get_args(View):
         raise InputError(
-            f"{path}: an entry of Words reads `word, word @view => description`, got {entry!r:.80}. Mend it."
+            f"{path}: an entry of Words reads `word, word @view => description`, got {entry!r:.80}. Correct it."
         )
     return Word(words, place, description.strip())  # type: ignore[arg-type]

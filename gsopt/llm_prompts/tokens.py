@@ -1,4 +1,4 @@
-"""How many tokens CLIP makes of a text: counted with a prior's own tokenizer, else estimated from above. No torch.
+"""Counts the CLIP tokens of a text with a prior's own tokenizer, or estimates them from above. No torch.
 
 The estimate: begin and end, then per word ceil(letters / 2.5), one per digit, one per byte of all else; a word in other
 than lower or title case counts per letter. Against CLIP's real vocabulary (49,408 tokens) it is never too low on the
@@ -18,26 +18,26 @@ from typing import Any
 
 from gsopt.errors import InputError
 
-LONGEST = 77
-LARGEST_FILE = 32 << 20
+MAX_TOKENS = 77
+MAX_FILE_BYTES = 32 << 20
 LETTERS_PER_TOKEN = 2.5
 PIECE = re.compile(r"'(?:s|t|re|ve|m|ll|d)|[^\W\d_]+|\d|[^\s\w]+|_")
 
 
 @dataclass(frozen=True)
-class Counter:
-    """Counts tokens, begin and end included."""
+class TokenCounter:
+    """A counter of tokens, begin and end included."""
 
     name: str
-    """What counts, for people."""
+    """Displayed name of the tokenizer."""
     exact: bool
-    longest: int
-    """Tokens that the encoder reads."""
+    max_tokens: int
+    """Token limit of the encoder."""
     count: Callable[[str], int]
 
 
-def estimated(text: str) -> int:
-    """From above, see the module."""
+def estimate_tokens(text: str) -> int:
+    """Returns an upper estimate, see the module."""
     return 2 + sum(map(_estimate, PIECE.findall(text)))
 
 
@@ -49,24 +49,24 @@ def _estimate(piece: str) -> int:
     return len(piece.encode("utf-8", "replace"))
 
 
-ESTIMATE = Counter("an estimate from above (no tokenizer at hand)", False, LONGEST, estimated)
+ESTIMATED_COUNTER = TokenCounter("an estimate from above (no tokenizer at hand)", False, MAX_TOKENS, estimate_tokens)
 
 
-def counter_for(prior: Path | None) -> Counter:
-    """Of the tokenizer in a diffusers folder, the estimate where there is none or `tokenizers` is not installed.
+def counter_for(prior: Path | None) -> TokenCounter:
+    """Returns a counter for a diffusers folder; without tokenizer, or without package `tokenizers`, the estimate.
 
-    Raises InputError for a tokenizer that cannot be read.
+    Raises InputError for an unreadable tokenizer.
     """
     folder = None if prior is None else prior / "tokenizer"
     if folder is None or not folder.is_dir():
-        return ESTIMATE
+        return ESTIMATED_COUNTER
     try:
         import tokenizers
     except ImportError:
-        return ESTIMATE
+        return ESTIMATED_COUNTER
     try:
         tokenizer = _whole(tokenizers, folder) if (folder / "tokenizer.json").is_file() else _legacy(tokenizers, folder)
-        longest = min(LONGEST, int(_json(folder / "tokenizer_config.json").get("model_max_length", LONGEST)))
+        longest = min(MAX_TOKENS, int(_json(folder / "tokenizer_config.json").get("model_max_length", MAX_TOKENS)))
     except Exception as error:  # tokenizers raises plain exceptions
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"Cannot read the tokenizer {folder}: {reason:.200}. Fetch the model again.") from error
@@ -74,7 +74,7 @@ def counter_for(prior: Path | None) -> Counter:
     def count(text: str) -> int:
         return len(tokenizer.encode(text, add_special_tokens=False).ids) + 2
 
-    return Counter(f"the tokenizer of {prior}", True, longest, count)
+    return TokenCounter(f"the tokenizer of {prior}", True, longest, count)
 
 
 def _whole(tokenizers: Any, folder: Path) -> Any:
@@ -85,7 +85,7 @@ def _whole(tokenizers: Any, folder: Path) -> Any:
 
 
 def _legacy(tokenizers: Any, folder: Path) -> Any:
-    """vocab.json and merges.txt: byte-level BPE with word ends (Radford et al. 2021), lower case."""
+    """Loads vocab.json and merges.txt: byte-level BPE with word ends (Radford et al. 2021), lower case."""
     from tokenizers import Regex, models, normalizers, pre_tokenizers
 
     lines = _bytes(folder / "merges.txt").decode("utf-8").splitlines()
@@ -112,7 +112,7 @@ def _json(path: Path) -> Any:
 
 def _bytes(path: Path) -> bytes:
     with open(path, "rb") as file:
-        data = file.read(LARGEST_FILE + 1)
-    if len(data) > LARGEST_FILE:
-        raise ValueError(f"{path.name} is larger than {LARGEST_FILE} bytes")
+        data = file.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise ValueError(f"{path.name} is larger than {MAX_FILE_BYTES} bytes")
     return data

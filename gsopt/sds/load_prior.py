@@ -1,4 +1,4 @@
-"""Opens a prior by name. What only some priors need is imported when that prior is asked for."""
+"""Opens a prior by name and imports only the modules that this prior needs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gsopt.sds.select_prior import EMBEDDED
 
 
 def open_prior(name: str, config: GuidanceConfig) -> Prior:
-    """The prior of that name, checked but not yet loaded.
+    """Returns the prior of that name, checked but not yet loaded.
 
-    Raises InputError for one that is missing or broken, UsageError for settings it cannot have, MissingDependency
+    Raises InputError for a missing or broken prior, UsageError for settings it does not support, MissingDependency
     without diffusers.
     """
     from gsopt.sds.priors.view_conditioned import ViewPrior, is_view_prior

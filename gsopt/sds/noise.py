@@ -6,7 +6,7 @@ With a = alphas_cumprod[t] (Ho et al. 2020; "signal" below):
     (2)  v   = sqrt(a) eps - sqrt(1-a) x0                  (Salimans & Ho 2022)
 
 so that each of x0, eps and v gives the others once x_t is known. SD 2.1 at 768 px predicts v, its base model eps, the
-embedded prior x0; everything above this file speaks of x0 only.
+embedded prior x0; all modules above this one use x0 only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gsopt import check
 from gsopt.errors import InputError
 
 Prediction = Literal["epsilon", "v_prediction", "sample"]
-"""What the network's output is, in the words of diffusers' scheduler_config.json."""
+"""Kind of the network's output, as diffusers' scheduler_config.json names it."""
 PREDICTIONS: tuple[str, ...] = get_args(Prediction)
 
 Latents = Float[Tensor, "B C h w"]
@@ -34,7 +34,7 @@ Signal = Float[Tensor, "B 1 1 1"]
 
 @dataclass(frozen=True)
 class NoiseSchedule:
-    """How much of the signal is left at each of a model's T steps."""
+    """Share of the signal in x_t at each of a model's T steps."""
 
     alphas_cumprod: Float[Tensor, "T"]
     """Falling, in [0, 1]; float64 on the CPU."""
@@ -43,16 +43,16 @@ class NoiseSchedule:
         return len(self.alphas_cumprod)
 
     def signal(self, t: Int[Tensor, "B"], like: Tensor) -> Signal:
-        """a of every row, beside `like`."""
+        """Returns a of every row, on the device and in the type of `like`."""
         return self.alphas_cumprod[t.cpu()].view(-1, 1, 1, 1).to(like)
 
     def step(self, share: float) -> int:
-        """The step at a share of the process: 0 is (almost) clean, 1 all noise."""
+        """Returns the step at a share of the process: 0 is (almost) clean, 1 all noise."""
         return min(len(self) - 1, max(0, math.floor(share * len(self))))
 
     @staticmethod
     def of(alphas_cumprod: Tensor) -> NoiseSchedule:
-        """Checked; InputError for what is no noise schedule."""
+        """Checks the values; raises InputError for an invalid noise schedule."""
         values = alphas_cumprod.detach().double().cpu()
         check.shape("alphas_cumprod", values, (None,))
         check.finite("alphas_cumprod", values)
@@ -70,7 +70,7 @@ def add_noise(x0: Latents, eps: Latents, signal: Signal) -> Latents:
 
 
 def x0_from(output: Latents, x_t: Latents, signal: Signal, prediction: Prediction) -> Latents:
-    """The clean image that a network's output stands for: (1) and (2) solved for x0."""
+    """Returns x0 from a network's output: (1) and (2) solved for x0."""
     if prediction == "sample":
         return output
     if prediction == "v_prediction":
@@ -79,14 +79,14 @@ def x0_from(output: Latents, x_t: Latents, signal: Signal, prediction: Predictio
 
 
 def output_for(x0: Latents, eps: Latents, signal: Signal, prediction: Prediction) -> Latents:
-    """What a network of this kind should answer: its training target."""
+    """Returns the training target of a network of this kind."""
     if prediction == "sample":
         return x0
     return eps if prediction == "epsilon" else signal.sqrt() * eps - (1 - signal).sqrt() * x0
 
 
 def eps_from(x0: Latents, x_t: Latents, signal: Signal) -> Latents:
-    """The noise that leads from x0 to x_t: (1) solved for eps."""
+    """Returns the noise between x0 and x_t: (1) solved for eps."""
     return (x_t - signal.sqrt() * x0) / (1 - signal).sqrt()
 
 
@@ -104,6 +104,6 @@ def weight(kind: str, signal: Signal) -> Signal:
 
 
 def generator(seed: int, step: int, view: int, purpose: str) -> torch.Generator:
-    """A CPU generator that depends on nothing but its arguments: a resumed run draws what an unbroken one would."""
+    """A CPU generator that depends on nothing but its arguments: a resumed run draws the same numbers."""
     digest = hashlib.blake2b(f"{seed}/{step}/{view}/{purpose}".encode(), digest_size=8).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest, "little") >> 1)

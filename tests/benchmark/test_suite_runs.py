@@ -23,10 +23,10 @@ from gsopt.benchmark.suite import definition, result_file, run_figures, run_key,
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.data.scene import load_scene
 from gsopt.geometry import quats
-from gsopt.llm_prompts.schema import Prompt, PromptSet, write_set
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.results.finished_run import draw
+from gsopt.sds.prompts import Prompt, PromptSet, write_set
 
 CASES = [
     definition.Case("objects-4", f"objects/{name}", "4", arm, 2000, 0, ("--lambda-sds", "0", name, arm))

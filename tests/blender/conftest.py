@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "llm_prompts")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from made_splats import random_splats  # noqa: E402
 

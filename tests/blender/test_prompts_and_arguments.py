@@ -25,7 +25,7 @@ def test_what_is_written_is_read_with_all_that_stands_beside(odd_folder: Path) -
 
 
 def test_gsopt_reads_the_same_prompts(tmp_path: Path) -> None:
-    schema = pytest.importorskip("gsopt.llm_prompts.schema")
+    schema = pytest.importorskip("gsopt.sds.prompts")
     write_prompts(tmp_path / "a.json", Document(PROMPTS))
     theirs = schema.read_prompts(tmp_path / "a.json")
     found = tuple(getattr(theirs, "prompts", theirs))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,18 +17,17 @@ from gsopt.config.train import InitConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.finetune import evaluation, reconstruction_pairs
 from gsopt.finetune.batches import draw
-from gsopt.finetune.reconstruction_pairs import Pairs, look, make_pairs, whole_scene
-from gsopt.finetune.run import Lessons
-from gsopt.finetune.trainer import STATE, Training, loss
-from gsopt.finetune.training_config import Course
+from gsopt.finetune.reconstruction_pairs import Pairs, make_pairs, render_pairs, whole_scene
+from gsopt.finetune.scenes import TrainingScenes
+from gsopt.finetune.trainer import STATE, PriorTrainer, loss
+from gsopt.finetune.training_config import PriorTrainingConfig
 from gsopt.init import first_gaussians
 from gsopt.raster.api import make_backend
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.priors.protocol import Condition
-from gsopt.sds.priors.view_conditioned import CHANNELS, ViewPrior, make_unet, predict
+from gsopt.sds.priors.view_conditioned import INPUT_CHANNELS, ViewPrior, make_unet, predict
 
 pytest.importorskip("diffusers")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
 from tiny_scenes import write_dataset
 
 SIZE = 64
@@ -38,7 +36,7 @@ SIZE = 64
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> None:
     """Fits of a handful of steps, few renders to measure on: how much is learned is not what is tested."""
-    reconstruction_pairs.LENGTHS, evaluation.MOST = (12,), 2
+    reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +57,7 @@ def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pa
     out = tmp_path_factory.mktemp("priors") / "mine"
     assert main([*command(scenes, out)]) == 0
     yield out
-    shutil.rmtree(out)  # 200 MB: the optimiser's state of every weight
+    shutil.rmtree(out)  # 200 MB: the optimizer's state of every weight
 
 
 def command(scenes: Path, out: Path, *more: str) -> list[str]:
@@ -68,7 +66,7 @@ def command(scenes: Path, out: Path, *more: str) -> list[str]:
 
 
 def test_an_untrained_network_gives_the_render_back() -> None:
-    planes = torch.rand(2, CHANNELS - 3, SIZE, SIZE) * 2 - 1
+    planes = torch.rand(2, INPUT_CHANNELS - 3, SIZE, SIZE) * 2 - 1
     x0 = predict(make_unet(0), torch.randn(2, 3, SIZE, SIZE), torch.tensor([3, 700]), planes)
     assert torch.equal(x0, planes[:, :3])
 
@@ -88,7 +86,7 @@ def test_mirror_images_count_as_input_views(scenes: Path) -> None:
     gaussians, _ = first_gaussians(scene, InitConfig(count=300), 0, 0)
     backend = make_backend("cpu", 1)
     alone, with_images = (
-        look(gaussians, replace(few, mirrored=images), scene.train[4:], SIZE, backend).uncertainty.float()
+        render_pairs(gaussians, replace(few, mirrored=images), scene.train[4:], SIZE, backend).uncertainty.float()
         for images in ((), scene.train[2:4])
     )
     assert with_images.mean() < 0.9 * alone.mean()
@@ -104,31 +102,31 @@ def test_pairs_survive_their_file(pairs: Pairs, tmp_path: Path) -> None:
 
 
 def test_training_learns_and_resumes_to_the_bit(pairs: Pairs, tmp_path: Path) -> None:
-    course = Course(steps=8, batch=2, lr=2e-3)
-    whole = Training(make_unet(0), course)
+    config = PriorTrainingConfig(steps=8, batch=2, lr=2e-3)
+    whole = PriorTrainer(make_unet(0), config)
     losses = [whole.advance(pairs) for _ in range(8)]
-    first = Training(make_unet(0), course)
+    first = PriorTrainer(make_unet(0), config)
     for _ in range(5):
         first.advance(pairs)
     first.save(tmp_path / STATE)
-    second = Training(make_unet(1), course)
+    second = PriorTrainer(make_unet(1), config)
     second.restore(tmp_path / STATE)
     assert [second.advance(pairs) for _ in range(3)] == losses[5:]
     for name, value in whole.average.items():
         assert torch.equal(value, second.average[name])
     with pytest.raises(InputError, match="Cannot continue"):
-        Training(make_unet(0), Course(steps=13, batch=2)).restore(tmp_path / STATE)
+        PriorTrainer(make_unet(0), PriorTrainingConfig(steps=13, batch=2)).restore(tmp_path / STATE)
 
 
 def test_training_lowers_the_loss(pairs: Pairs) -> None:
-    """Of one and the same lesson, before and after twenty steps on the pairs it comes from: renders half as bright."""
+    """The loss of a fixed example, before and after twenty steps on its pairs: renders half as bright."""
     pairs = replace(pairs, render=torch.cat([pairs.truth[:, :3] // 2, pairs.truth[:, 3:]], 1))
-    training = Training(make_unet(0), Course(steps=20, batch=3, lr=1e-3))
-    lesson = draw(pairs, 4, training.noise, torch.Generator().manual_seed(0))
-    before = float(loss(training.unet, lesson).detach())
+    trainer = PriorTrainer(make_unet(0), PriorTrainingConfig(steps=20, batch=3, lr=1e-3))
+    example = draw(pairs, 4, trainer.noise, torch.Generator().manual_seed(0))
+    before = float(loss(trainer.unet, example).detach())
     for _ in range(20):
-        training.advance(pairs)
-    assert float(loss(training.unet, lesson).detach()) < 0.8 * before
+        trainer.advance(pairs)
+    assert float(loss(trainer.unet, example).detach()) < 0.8 * before
 
 
 def test_the_folder_is_a_prior(prior: Path) -> None:
@@ -169,7 +167,7 @@ def test_the_same_command_goes_on_and_another_is_refused(prior: Path, scenes: Pa
 @pytest.mark.parametrize("size", [100, 66, 32])
 def test_a_size_that_no_prior_can_have_is_refused_before_any_work(size: int) -> None:
     with pytest.raises(UsageError, match=r"`--size`"):
-        Lessons((Path("a"),), (), size=size)
+        TrainingScenes((Path("a"),), (), size=size)
 
 
 def test_a_scene_of_one_view_is_named(tmp_path: Path) -> None:

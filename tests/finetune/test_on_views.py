@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,8 +11,6 @@ import torch
 
 pytest.importorskip("diffusers")
 pytest.importorskip("peft")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sds"))
 import tiny_sd21
 from tiny_scenes import write_dataset
 
@@ -22,10 +19,10 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.finetune.on_views import run as stage
 from gsopt.finetune.on_views import sample_sheet
 from gsopt.finetune.on_views import trainer as training_module
-from gsopt.finetune.on_views.batches import Lesson, Lessons, make_lessons
-from gsopt.finetune.on_views.images import Chosen, find_pictures
-from gsopt.finetune.on_views.trainer import STATE, Training, loss
-from gsopt.finetune.on_views.training_config import Preparation, Study
+from gsopt.finetune.on_views.batches import TrainingExample, TrainingExamples, make_examples
+from gsopt.finetune.on_views.images import ViewSelection, find_images
+from gsopt.finetune.on_views.trainer import STATE, ImageTrainer, loss
+from gsopt.finetune.on_views.training_config import ImagePreparation, ImageTrainingConfig
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.noise import Prediction
 from gsopt.sds.priors.folder import find_folder
@@ -37,8 +34,8 @@ STEPS = 6
 
 @pytest.fixture(scope="module", autouse=True)
 def small_sheets() -> None:
-    """What they show is not what is tested."""
-    sample_sheet.STEPS, sample_sheet.SHOWN = 2, 1
+    """Their content is not tested."""
+    sample_sheet.STEPS, sample_sheet.SHOWN_IMAGES = 2, 1
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +49,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def lessons(base: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Lessons:
-    pictures = find_pictures([scene], Chosen(), "a red chair", lambda line: None)
-    how = Preparation(flip=True, variants=2)
-    return make_lessons(opened(base), pictures, how, 0, tmp_path_factory.mktemp("lessons"), lambda line: None)
+def examples(base: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainingExamples:
+    images = find_images([scene], ViewSelection(), "a red chair", lambda line: None)
+    preparation = ImagePreparation(flip=True, variants=2)
+    return make_examples(opened(base), images, preparation, 0, tmp_path_factory.mktemp("lessons"), lambda line: None)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +101,7 @@ def test_the_network_is_asked_for_what_it_predicts(base: Path, kind: Prediction)
 
     prior.__dict__["unet"] = unet
     tokens = torch.randn(1, 77, tiny_sd21.WIDTH, generator=random)
-    found = loss(prior, Lesson(z, eps, torch.tensor([700]), tokens))
+    found = loss(prior, TrainingExample(z, eps, torch.tensor([700]), tokens))
     a = float(prior.schedule.alphas_cumprod[700])
     target = {"epsilon": eps, "v_prediction": a**0.5 * eps - (1 - a) ** 0.5 * z, "sample": z}[kind]
     assert float(found) == pytest.approx(float(((answer - target) ** 2).mean()), rel=1e-5)
@@ -113,24 +110,24 @@ def test_the_network_is_asked_for_what_it_predicts(base: Path, kind: Prediction)
     assert torch.equal(seen[0][2], tokens)
 
 
-def test_lessons_are_spread_over_pictures_noise_and_words(lessons: Lessons) -> None:
-    drawn = [lessons.draw(0, step, 0, 1000) for step in range(400)]
-    times = torch.cat([lesson.t for lesson in drawn]).float()
-    assert lessons.latents.shape == (3, 2, 4, 8, 8)
+def test_lessons_are_spread_over_pictures_noise_and_words(examples: TrainingExamples) -> None:
+    drawn = [examples.draw(0, step, 0, 1000) for step in range(400)]
+    times = torch.cat([example.t for example in drawn]).float()
+    assert examples.latents.shape == (3, 2, 4, 8, 8)
     assert abs(float(times.mean()) - 500) < 60
     assert (float(times.min()), float(times.max())) < (30, 1000)
-    assert lessons.tokens is not None
-    wordless = sum(torch.equal(lesson.tokens[0], lessons.tokens[0]) for lesson in drawn)
+    assert examples.tokens is not None
+    wordless = sum(torch.equal(example.tokens[0], examples.tokens[0]) for example in drawn)
     assert 20 < wordless < 65  # one in ten
-    different = {lesson.z.numpy().tobytes() for lesson in drawn}
+    different = {example.z.numpy().tobytes() for example in drawn}
     assert len(different) == 6
-    again = lessons.draw(0, 7, 0, 1000)
+    again = examples.draw(0, 7, 0, 1000)
     assert torch.equal(again.eps, drawn[7].eps)
-    assert not torch.equal(again.eps, lessons.draw(0, 7, 1, 1000).eps)
-    assert not torch.equal(again.eps, lessons.draw(1, 7, 0, 1000).eps)
+    assert not torch.equal(again.eps, examples.draw(0, 7, 1, 1000).eps)
+    assert not torch.equal(again.eps, examples.draw(1, 7, 0, 1000).eps)
 
 
-def test_latents_are_those_of_the_prior(base: Path, scene: Path, lessons: Lessons) -> None:
+def test_latents_are_those_of_the_prior(base: Path, scene: Path, examples: TrainingExamples) -> None:
     """Scaled, of the image on white."""
     from gsopt.data.scene import load_scene
     from gsopt.sds.candidate_views import square_views
@@ -139,51 +136,55 @@ def test_latents_are_those_of_the_prior(base: Path, scene: Path, lessons: Lesson
     images = square_views(load_scene(scene).train, prior.size, torch.ones(3)).images
     with torch.no_grad():
         z = prior.encode(images[:1])
-    torch.testing.assert_close(lessons.latents[0, :1], z, rtol=0, atol=2e-3)
+    torch.testing.assert_close(examples.latents[0, :1], z, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("full", [False, True], ids=["lora", "full"])
-def test_training_learns_only_what_it_should(base: Path, lessons: Lessons, full: bool) -> None:
+def test_training_learns_only_what_it_should(base: Path, examples: TrainingExamples, full: bool) -> None:
     """The exam's loss falls; with LoRA every weight of the base stays as it was."""
-    training = Training(opened(base), lessons, Study(steps=25, batch=1, lr=2e-3 if full else 2e-2, full=full))
-    before = training.exam()
-    own = {n: p.detach().clone() for n, p in training.unet.named_parameters() if n not in training.trained}
+    trainer = ImageTrainer(
+        opened(base), examples, ImageTrainingConfig(steps=25, batch=1, lr=2e-3 if full else 2e-2, full=full)
+    )
+    before = trainer.evaluate()
+    own = {n: p.detach().clone() for n, p in trainer.unet.named_parameters() if n not in trainer.trained}
     for _ in range(25):
-        training.advance()
-    assert training.exam() < 0.9 * before
+        trainer.advance()
+    assert trainer.evaluate() < 0.9 * before
     assert bool(own) != full
-    assert all(torch.equal(own[n], p) for n, p in training.unet.named_parameters() if n in own)
+    assert all(torch.equal(own[n], p) for n, p in trainer.unet.named_parameters() if n in own)
     if not full:
-        assert all(".lora_" in name and value.dtype == torch.float32 for name, value in training.trained.items())
+        assert all(".lora_" in name and value.dtype == torch.float32 for name, value in trainer.trained.items())
 
 
 def test_large_models_recompute_their_blocks_to_the_same_change(
-    base: Path, lessons: Lessons, monkeypatch: pytest.MonkeyPatch
+    base: Path, examples: TrainingExamples, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study, found = Study(steps=2, batch=1, rank=2, lr=1e-2), []
+    config, found = ImageTrainingConfig(steps=2, batch=1, rank=2, lr=1e-2), []
     for bytes_from in (1 << 30, 0):
         monkeypatch.setattr(training_module, "LARGE", bytes_from)
-        training = Training(opened(base), lessons, study)
-        assert training.unet.is_gradient_checkpointing == (bytes_from == 0)
-        training.advance()
-        found.append(training.trained)
+        trainer = ImageTrainer(opened(base), examples, config)
+        assert trainer.unet.is_gradient_checkpointing == (bytes_from == 0)
+        trainer.advance()
+        found.append(trainer.trained)
     assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(*(f.values() for f in found), strict=True))
 
 
-def test_half_precision_is_for_what_is_frozen_only(base: Path, lessons: Lessons) -> None:
-    study = Study(steps=2, batch=1, rank=2, dtype="bfloat16")
-    training = Training(stage.open_base(find_folder(str(base)), study, Preparation()), lessons, study)
-    assert {value.dtype for value in training.trained.values()} == {torch.float32}
-    assert {p.dtype for p in training.unet.parameters() if not p.requires_grad} == {torch.bfloat16}
-    before = {name: value.detach().clone() for name, value in training.trained.items()}
-    training.advance()
-    assert any(not torch.equal(value, before[name]) for name, value in training.trained.items())
+def test_half_precision_is_for_what_is_frozen_only(base: Path, examples: TrainingExamples) -> None:
+    config = ImageTrainingConfig(steps=2, batch=1, rank=2, dtype="bfloat16")
+    trainer = ImageTrainer(stage.open_base(find_folder(str(base)), config, ImagePreparation()), examples, config)
+    assert {value.dtype for value in trainer.trained.values()} == {torch.float32}
+    assert {p.dtype for p in trainer.unet.parameters() if not p.requires_grad} == {torch.bfloat16}
+    before = {name: value.detach().clone() for name, value in trainer.trained.items()}
+    trainer.advance()
+    assert any(not torch.equal(value, before[name]) for name, value in trainer.trained.items())
 
 
 @pytest.mark.parametrize("full", [False, True], ids=["lora", "full"])
-def test_a_resumed_training_has_the_same_bits(base: Path, lessons: Lessons, full: bool, tmp_path: Path) -> None:
-    study = Study(steps=6, batch=2, lr=1e-2, rank=2, full=full)
-    whole, first, second = (Training(opened(base), lessons, study) for _ in range(3))
+def test_a_resumed_training_has_the_same_bits(
+    base: Path, examples: TrainingExamples, full: bool, tmp_path: Path
+) -> None:
+    config = ImageTrainingConfig(steps=6, batch=2, lr=1e-2, rank=2, full=full)
+    whole, first, second = (ImageTrainer(opened(base), examples, config) for _ in range(3))
     losses = [whole.advance() for _ in range(6)]
     for _ in range(4):
         first.advance()

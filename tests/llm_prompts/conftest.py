@@ -1,14 +1,11 @@
-"""A photo of nothing in particular, a tiny pipeline, and the tiny scenes of other folders."""
+"""A photo of nothing in particular and tiny models."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / folder) for folder in ("sds", "training")]
 
 
 @pytest.fixture

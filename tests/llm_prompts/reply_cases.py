@@ -1,4 +1,4 @@
-"""What servers and models have been seen to answer, or could: the table in docs/howto/prompts.md."""
+"""Observed and possible replies of servers and models: the table in docs/howto/prompts.md."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class Case:
     """One row of the table."""
 
     does: str
-    """What the server does."""
+    """Behavior of the server."""
     script: Sequence[Says]
     ends: str
-    """What `gsopt prompts` ends in: whose prompts, or the error. URL stands for the address."""
+    """Result of `gsopt prompts`: whose prompts, or the error. URL stands for the address."""
 
 
 LLM = "3 llm:tiny"
-TEMPLATE_ERROR = "error: The model gave no prompt that can be used after 3 answers"
+TEMPLATE_ERROR = "error: The model gave no usable prompt after 3 answers"
 
 CASES = (
     Case("a valid reply", [VALID], LLM),

@@ -13,7 +13,7 @@ from gsopt import cli
 from gsopt.cli.train import read_flags
 from gsopt.cli.train_flags import parse
 from gsopt.config.guidance import GuidanceConfig
-from gsopt.llm_prompts.schema import read_prompts
+from gsopt.sds.prompts import read_prompts
 
 SCRIPT = Path(__file__).resolve().parents[2] / "experiments" / "prompts.py"
 
@@ -71,12 +71,12 @@ def test_every_arm_is_run_once_with_its_own_prompts_and_the_table_pairs_them(
 
 
 def test_every_validation_object_has_notes_that_make_prompts(benchmark, tmp_path: Path, shared_data: Path) -> None:
-    from gsopt.llm_prompts.generate import Job, make_prompts
+    from gsopt.llm_prompts.generate import PromptJob, make_prompts
 
     notes = json.loads((SCRIPT.parent / "prompts_notes.json").read_text())
     objects = [name.split("/")[-1] for name in json.loads((shared_data / "splits.json").read_text())["val"]]
     assert sorted(notes) == sorted(objects)
     for note in notes.values():
-        made = make_prompts(Job(**note), print).made
+        made = make_prompts(PromptJob(**note), print).made
         assert len(made.prompts) == 12
         assert made.object in note["notes"]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from gsopt.llm_prompts.tokens import counter_for, estimated
+from gsopt.llm_prompts.tokens import counter_for, estimate_tokens
 
 FILE = os.environ.get("GSOPT_CLIP_BPE", "")
 pytestmark = pytest.mark.skipif(not FILE, reason="opt-in: GSOPT_CLIP_BPE")
@@ -55,7 +55,7 @@ def test_the_estimate_is_hardly_ever_too_low(true_count) -> None:
     templates = sentences(sorted((ROOT / "gsopt" / "llm_prompts" / "templates").glob("*.md")))
     docs = sentences(sorted((ROOT / "docs").rglob("*.md")))
     for texts, most_too_low in ((templates, 0.0), (docs, 0.005)):
-        ratios = [estimated(text) / true_count(text) for text in texts]
+        ratios = [estimate_tokens(text) / true_count(text) for text in texts]
         too_low = sum(ratio < 1 for ratio in ratios)
         print(f"{len(texts)} texts, {too_low} too low, mean ratio {sum(ratios) / len(ratios):.2f}")
         assert too_low <= most_too_low * len(texts)

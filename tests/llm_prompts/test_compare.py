@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from priors import PixelPrior, gaussian_posterior
+from analytic_priors import PixelPrior, gaussian_posterior
 from tiny_scenes import write_dataset
 
 from gsopt import cli
-from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, write_prompts, write_set
 from gsopt.sds import load_prior
+from gsopt.sds.prompts import Prompt, PromptSet, ReferenceImage, write_prompts, write_set
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def compare(dataset: Path, folder: Path, prior: str, *files: Path) -> int:
 def test_sets_are_judged_on_the_same_views_and_shown_side_by_side(dataset: Path, sd21: Path, tmp_path: Path) -> None:
     one, two = tmp_path / "chair.json", tmp_path / "evil.json"
     write_prompts(one, [Prompt("a red chair")])
-    write_set(two, PromptSet((Prompt("<b>blue</b> & chair", source="llm:m"),), images=(Picture("a.png"),)))
+    write_set(two, PromptSet((Prompt("<b>blue</b> & chair", source="llm:m"),), images=(ReferenceImage("a.png"),)))
     assert compare(dataset, tmp_path, str(sd21), one, two, one) == 0
     figures = json.loads((tmp_path / "page.json").read_text())
     names = [arm["name"] for arm in figures["arms"]]

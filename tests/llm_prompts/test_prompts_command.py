@@ -16,8 +16,8 @@ from tiny_scenes import write_dataset
 from gsopt import cli
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError
-from gsopt.llm_prompts.review import Abandoned, edited, review
-from gsopt.llm_prompts.schema import Picture, Prompt, PromptSet, read_set, write_set
+from gsopt.llm_prompts.review import ReviewAborted, edited, review
+from gsopt.sds.prompts import Prompt, PromptSet, ReferenceImage, read_set, write_set
 from gsopt.training.guided.references import reference_paths
 from gsopt.training.guided.start import require_guidance
 
@@ -124,11 +124,11 @@ def test_an_answer_that_cannot_be_used_asks_again(capsys) -> None:
 
 
 def test_a_picture_is_used_only_when_it_is_accepted_in_so_many_words() -> None:
-    everything = PromptSet(images=tuple(Picture(f"{i}.png") for i in range(5)))
+    everything = PromptSet(images=tuple(ReferenceImage(f"{i}.png") for i in range(5)))
     answers = iter(["", "r", "what?", "a", "y", "n"])
     reviewed = review(everything, lambda _: next(answers), lambda _: None)
     assert [picture.accepted for picture in reviewed.images] == [False, False, True, True, False]
-    with pytest.raises(Abandoned):
+    with pytest.raises(ReviewAborted):
         review(everything, lambda _: "q", lambda _: None)
 
 
@@ -141,7 +141,7 @@ def test_an_edited_prompt_is_the_experts_and_an_unchanged_one_is_not() -> None:
 
 
 def test_training_reads_the_prompts_and_the_pictures_that_were_accepted(tmp_path: Path) -> None:
-    pictures = (Picture("prompts-images/001.png", accepted=True), Picture("prompts-images/002.png"))
+    pictures = (ReferenceImage("prompts-images/001.png", accepted=True), ReferenceImage("prompts-images/002.png"))
     (tmp_path / "prompts-images").mkdir()
     for picture in pictures:
         Image.new("RGB", (8, 8)).save(tmp_path / picture.file)

@@ -19,7 +19,7 @@ import pytest
 from scripted_server import free_port
 
 from gsopt import cli
-from gsopt.llm_prompts.schema import read_set
+from gsopt.sds.prompts import read_set
 
 PYTHON = os.environ.get("GSOPT_SERVE", "")
 MODEL = os.environ.get("GSOPT_SERVE_MODEL", "")

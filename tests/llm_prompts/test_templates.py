@@ -9,12 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError, UsageError
-from gsopt.llm_prompts.deduplicate import is_like
-from gsopt.llm_prompts.expand import FEWEST_WITH_SIDES, SIDES, Wish, expand, filled_up, own_words, slot_of
-from gsopt.llm_prompts.schema import Prompt
-from gsopt.llm_prompts.subject import content, find_object, names, with_article
+from gsopt.llm_prompts.deduplicate import is_similar
+from gsopt.llm_prompts.expand import (
+    MIN_PROMPTS_WITH_SIDES,
+    SIDES,
+    PromptSpec,
+    expand,
+    expert_prompt,
+    fill_with_template,
+    slot_of,
+)
+from gsopt.llm_prompts.subject import content_words, find_object, names_object, with_article
 from gsopt.llm_prompts.templates import DOMAINS, fill, load_template
-from gsopt.llm_prompts.tokens import ESTIMATE, LONGEST
+from gsopt.llm_prompts.tokens import ESTIMATED_COUNTER, MAX_TOKENS
+from gsopt.sds.prompts import Prompt
 
 NOTES = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), min_size=1, max_size=300)
 
@@ -56,7 +64,7 @@ def test_notes_without_an_object_ask_for_a_category(notes: str) -> None:
     ],
 )
 def test_a_text_keeps_the_noun_in_either_number(text: str, noun: str, keeps: bool) -> None:
-    assert names(text, noun) == keeps
+    assert names_object(text, noun) == keeps
 
 
 def test_articles_fit_the_noun() -> None:
@@ -70,36 +78,38 @@ def test_articles_fit_the_noun() -> None:
 @settings(max_examples=25, deadline=None)
 @given(notes=NOTES, n=st.integers(1, 12))
 def test_whatever_the_notes_the_template_gives_valid_distinct_prompts(domain: str, notes: str, n: int) -> None:
-    wish = Wish(notes, "chair", n, 3)
+    spec = PromptSpec(notes, "chair", n, 3)
     template = load_template(domain)
-    prompts = expand(template, wish, ESTIMATE)
-    assert prompts == expand(template, wish, ESTIMATE)
+    prompts = expand(template, spec, ESTIMATED_COUNTER)
+    assert prompts == expand(template, spec, ESTIMATED_COUNTER)
     assert {prompt.source for prompt in prompts} == {"template"}
     assert all(prompt.rationale for prompt in prompts)
     for i, prompt in enumerate(prompts):
         for other in prompts[:i]:
             overlap = "all" in (prompt.view, other.view) or prompt.view == other.view
-            assert prompt.polarity != other.polarity or not overlap or not is_like(prompt.text, other.text)
+            assert prompt.polarity != other.polarity or not overlap or not is_similar(prompt.text, other.text)
     fitting = [prompt for prompt in prompts if prompt.text.count(notes.strip()) == 0 or len(notes) < 60]
-    assert all(ESTIMATE.count(prompt.text) <= LONGEST for prompt in fitting)
+    assert all(ESTIMATED_COUNTER.count(prompt.text) <= MAX_TOKENS for prompt in fitting)
 
 
 @pytest.mark.parametrize("domain", DOMAINS)
-@pytest.mark.parametrize("n", [1, 2, FEWEST_WITH_SIDES - 1, FEWEST_WITH_SIDES, 8, 12])
+@pytest.mark.parametrize("n", [1, 2, MIN_PROMPTS_WITH_SIDES - 1, MIN_PROMPTS_WITH_SIDES, 8, 12])
 def test_as_many_prompts_as_wished_one_for_each_side_when_there_is_room(domain: str, n: int) -> None:
-    prompts = expand(load_template(domain), Wish("worn oak chair", "chair", n, 3), ESTIMATE)
+    prompts = expand(load_template(domain), PromptSpec("worn oak chair", "chair", n, 3), ESTIMATED_COUNTER)
     positive = [prompt for prompt in prompts if prompt.polarity == "positive"]
     assert len(positive) == n
     assert len(prompts) - n == 3
-    assert {p.view for p in positive if p.view != "all"} == (set(SIDES) if n >= FEWEST_WITH_SIDES else set())
-    assert all(names(prompt.text, "chair") for prompt in positive)
+    assert {p.view for p in positive if p.view != "all"} == (set(SIDES) if n >= MIN_PROMPTS_WITH_SIDES else set())
+    assert all(names_object(prompt.text, "chair") for prompt in positive)
 
 
 def test_what_the_template_knows_about_a_word_is_said_where_the_word_is_and_nowhere_else() -> None:
     template = load_template("medicine")
 
     def said(notes: str) -> str:
-        return " ".join(prompt.text for prompt in expand(template, Wish(notes, find_object(notes), 8, 0), ESTIMATE))
+        return " ".join(
+            prompt.text for prompt in expand(template, PromptSpec(notes, find_object(notes), 8, 0), ESTIMATED_COUNTER)
+        )
 
     assert "thinned cortex" in said("femur, osteoporotic")
     assert "thinned cortex" not in said("femur")
@@ -111,7 +121,7 @@ def test_what_the_notes_deny_is_not_said() -> None:
     template = load_template("robotics")
 
     def said(notes: str) -> str:
-        prompts = expand(template, Wish(notes, "chair", 12, 0), ESTIMATE)
+        prompts = expand(template, PromptSpec(notes, "chair", 12, 0), ESTIMATED_COUNTER)
         return " ".join(prompt.text.replace(notes, "") for prompt in prompts)
 
     assert "armrests" in said("chair with arms")
@@ -124,15 +134,17 @@ def test_what_the_notes_deny_is_not_said() -> None:
 def test_negatives_never_deny_the_notes() -> None:
     template = load_template("environment")
     for notes in ("stone in water", "stone with grass", "polished stone"):
-        negatives = [p for p in expand(template, Wish(notes, "stone", 1, 9), ESTIMATE) if p.polarity == "negative"]
+        negatives = [
+            p for p in expand(template, PromptSpec(notes, "stone", 1, 9), ESTIMATED_COUNTER) if p.polarity == "negative"
+        ]
         assert negatives
-        assert not any(content(prompt.text) & content(notes) - {"stone"} for prompt in negatives)
+        assert not any(content_words(prompt.text) & content_words(notes) - {"stone"} for prompt in negatives)
 
 
 def test_long_notes_are_shortened_clause_by_clause_to_what_clip_reads() -> None:
     notes = "chair, " + ", ".join(f"detail number {i} of the wood" for i in range(60))
-    for prompt in expand(load_template("generic"), Wish(notes, "chair", 8, 0), ESTIMATE):
-        assert ESTIMATE.count(prompt.text) <= LONGEST
+    for prompt in expand(load_template("generic"), PromptSpec(notes, "chair", 8, 0), ESTIMATED_COUNTER):
+        assert ESTIMATED_COUNTER.count(prompt.text) <= MAX_TOKENS
 
 
 def test_slots_in_the_notes_are_not_filled_again() -> None:
@@ -140,17 +152,17 @@ def test_slots_in_the_notes_are_not_filled_again() -> None:
 
 
 def test_the_experts_words_come_first_and_as_they_are() -> None:
-    assert own_words(Wish(" femur,\n osteoporotic ", "femur", 8, 0)).text == "femur, osteoporotic"
-    assert own_words(Wish("femur", "femur", 8, 0)).source == "user"
+    assert expert_prompt(PromptSpec(" femur,\n osteoporotic ", "femur", 8, 0)).text == "femur, osteoporotic"
+    assert expert_prompt(PromptSpec("femur", "femur", 8, 0)).source == "user"
 
 
 def test_what_a_model_left_out_is_filled_up_slot_by_slot() -> None:
-    wish = Wish("worn oak chair", "chair", 6, 2)
+    spec = PromptSpec("worn oak chair", "chair", 6, 2)
     made = (Prompt("a chair from behind, three slats", view="back", source="llm:m"),)
-    prompts = filled_up(made, load_template("generic"), wish, ESTIMATE)
+    prompts = fill_with_template(made, load_template("generic"), spec, ESTIMATED_COUNTER)
     assert prompts[0] == made[0]
-    counts = {slot: sum(slot_of(p) == slot for p in prompts) for slot in wish.slots}
-    assert counts == wish.slots
+    counts = {slot: sum(slot_of(p) == slot for p in prompts) for slot in spec.slots}
+    assert counts == spec.slots
     assert {prompt.source for prompt in prompts[1:]} == {"template"}
 
 
@@ -182,7 +194,7 @@ def test_a_users_template_is_one_file_that_adds_to_what_it_extends(tmp_path: Pat
         *base.lists["phrases"],
     )
     assert own.system == base.system
-    texts = [prompt.text for prompt in expand(own, Wish("amphora", "amphora", 6, 0), ESTIMATE)]
+    texts = [prompt.text for prompt in expand(own, PromptSpec("amphora", "amphora", 6, 0), ESTIMATED_COUNTER)]
     assert "an amphora, two handles and a narrow neck" in texts
     assert "an amphora, a flat ring-shaped lip" in texts
 

@@ -1,4 +1,4 @@
-"""What a model wrote comes through as words or not at all; tokens are counted as the prior counts them."""
+"""Text of a model passes as plain words or not at all; tokens are counted as the prior counts them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError
-from gsopt.llm_prompts.expand import Wish
+from gsopt.llm_prompts.expand import PromptSpec
 from gsopt.llm_prompts.reply import read_reply, reply_schema
-from gsopt.llm_prompts.sanitize import LONGEST_WORDS, Unusable, cleaned, cleaned_rationale, printable
-from gsopt.llm_prompts.schema import Prompt
-from gsopt.llm_prompts.tokens import ESTIMATE, LONGEST, counter_for
+from gsopt.llm_prompts.sanitize import MAX_WORDS, UnusableText, cleaned, cleaned_rationale, printable
+from gsopt.llm_prompts.tokens import ESTIMATED_COUNTER, MAX_TOKENS, counter_for
+from gsopt.sds.prompts import Prompt
 
-WISH = Wish("worn oak chair", "chair", 8, 3)
+WISH = PromptSpec("worn oak chair", "chair", 8, 3)
 ANY = st.text(st.characters(codec=None), max_size=300)
 
 
@@ -54,7 +54,7 @@ def test_harmless_blemishes_are_mended(written: str, text: str) -> None:
     ],
 )  # fmt: skip
 def test_what_is_more_than_words_is_refused(text: str) -> None:
-    with pytest.raises(Unusable):
+    with pytest.raises(UnusableText):
         cleaned(text)
 
 
@@ -64,12 +64,12 @@ def test_what_is_more_than_words_is_refused(text: str) -> None:
 def test_whatever_comes_through_is_plain_and_stays_the_same(text: str) -> None:
     try:
         result = cleaned(text)
-    except Unusable:
+    except UnusableText:
         return
     Prompt(result)
     assert not any(unicodedata.category(c) in ("Cc", "Cf", "Cs", "Co", "Cn") for c in result)
     assert not re.search(r"[<>]\w|://|[{}$`\\]|\n", result)
-    assert 3 <= len(result.split()) <= LONGEST_WORDS
+    assert 3 <= len(result.split()) <= MAX_WORDS
 
 
 @settings(max_examples=200, deadline=None)
@@ -96,7 +96,7 @@ JSON = st.recursive(
 @given(answer=ANY | JSON.map(json.dumps) | st.tuples(ANY, JSON.map(json.dumps), ANY).map("".join))
 def test_any_answer_is_read_without_an_exception_and_what_is_taken_is_wanted(answer: str) -> None:
     pytest.importorskip("pydantic")
-    read = read_reply(answer, WISH, "llm:m", ESTIMATE, ())
+    read = read_reply(answer, WISH, "llm:m", ESTIMATED_COUNTER, ())
     assert all(prompt.source == "llm:m" for prompt in read.prompts)
     assert read.prompts or read.problems
     assert all(len(problem) < 300 for problem in read.problems)
@@ -106,7 +106,7 @@ def test_the_place_in_the_reply_decides_the_view_not_the_models_words() -> None:
     pytest.importorskip("pydantic")
     entry = {"text": "a chair with three slats", "why": "<script>", "view": "front", "weight": 99, "source": "user"}
     answer = json.dumps({"back": [entry], "below": [entry], "negative": [{"text": "blur", "why": "w"}]})
-    prompts = read_reply(answer, WISH, "llm:m", ESTIMATE, ()).prompts
+    prompts = read_reply(answer, WISH, "llm:m", ESTIMATED_COUNTER, ()).prompts
     assert prompts == (
         Prompt("a chair with three slats", view="back", source="llm:m"),
         Prompt("blur", polarity="negative", source="llm:m", rationale="w"),
@@ -115,14 +115,14 @@ def test_the_place_in_the_reply_decides_the_view_not_the_models_words() -> None:
 
 def test_views_in_words_are_refused_because_they_are_added_later() -> None:
     pytest.importorskip("pydantic")
-    read = read_reply('["the back view of a chair in oak"]', WISH, "llm:m", ESTIMATE, ())
+    read = read_reply('["the back view of a chair in oak"]', WISH, "llm:m", ESTIMATED_COUNTER, ())
     assert read.prompts == ()
     assert "view" in read.problems[0]
 
 
 def test_too_many_tokens_are_refused() -> None:
     pytest.importorskip("pydantic")
-    read = read_reply(json.dumps(["chair " + "xqzvk" * 60 + " of wood"]), WISH, "llm:m", ESTIMATE, ())
+    read = read_reply(json.dumps(["chair " + "xqzvk" * 60 + " of wood"]), WISH, "llm:m", ESTIMATED_COUNTER, ())
     assert "CLIP tokens" in read.problems[0]
 
 
@@ -146,21 +146,21 @@ def test_tokens_are_counted_as_the_priors_own_tokenizer_counts(sd21: Path, tmp_p
         reference.save_pretrained(tmp_path / "tokenizer")
     counter = counter_for(folder)
     assert counter.exact
-    assert counter.longest == LONGEST
+    assert counter.max_tokens == MAX_TOKENS
     for text in ("a red chair", "it's 42 blue chairs!", "Stühle 🪑", "", "x" * 500, "a  b\nc", "don't_stop"):
         assert counter.count(text) == len(reference(text, truncation=False).input_ids)
 
 
 def test_without_a_tokenizer_the_estimate_says_so(tmp_path: Path) -> None:
-    assert counter_for(None) is ESTIMATE
-    assert counter_for(tmp_path) is ESTIMATE
-    assert not ESTIMATE.exact
+    assert counter_for(None) is ESTIMATED_COUNTER
+    assert counter_for(tmp_path) is ESTIMATED_COUNTER
+    assert not ESTIMATED_COUNTER.exact
 
 
 @settings(max_examples=100, deadline=None)
 @given(text=st.text(max_size=60), more=st.text(max_size=20))
 def test_the_estimate_grows_with_the_text(text: str, more: str) -> None:
-    assert ESTIMATE.count(f"{text} {more}") >= ESTIMATE.count(text) >= 2
+    assert ESTIMATED_COUNTER.count(f"{text} {more}") >= ESTIMATED_COUNTER.count(text) >= 2
 
 
 def test_a_broken_tokenizer_is_an_input_error(tmp_path: Path) -> None:

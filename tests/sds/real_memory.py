@@ -1,4 +1,4 @@
-"""What a guided step needs at the real size, counted per tensor on networks that compute nothing (fake tensors)."""
+"""Memory of a guided step at the real size, counted per tensor on networks that compute nothing (fake tensors)."""
 
 from __future__ import annotations
 

@@ -29,19 +29,19 @@ FLAGS = [
 
 @dataclass
 class Step:
-    """What was seen."""
+    """Measurements of a step."""
 
     code: int = -1
     phases: list[Phase] = field(default_factory=list)
     rows: list[int] = field(default_factory=list)
-    """Of every call of the U-Net."""
+    """Rows of every call of the U-Net."""
     gradients: list[Gradients] = field(default_factory=list)
     weights: dict[str, int] = field(default_factory=dict)
     """Bytes of each network."""
     text_encoders: int = 0
     """Alive when the U-Net was called."""
     cpu_seconds: float = 0.0
-    """Of the guided step."""
+    """Peak of the guided step."""
     peak_rss: int = 0
 
 

@@ -19,7 +19,7 @@ from torch.utils._pytree import tree_leaves
 
 @dataclass
 class Phase:
-    """What one call needed."""
+    """Memory of one call."""
 
     name: str
     before: int

@@ -12,11 +12,11 @@ import torch
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError
-from gsopt.llm_prompts.schema import Prompt
-from gsopt.sds.conditioning import WORDS, Conditioning, encode, worded
+from gsopt.sds.conditioning import VIEW_WORDS, Conditioning, encode, with_view_word
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.protocol import Encoder
+from gsopt.sds.prompts import Prompt
 
 NOTHING = torch.empty(0, 3, 8, 8)
 
@@ -25,7 +25,7 @@ class FakeEncoder:
     """Every text is one token that tells its length; images are their mean color; alignment is what the test says."""
 
     name = "fake"
-    longest = 77
+    max_tokens = 77
 
     def __init__(
         self,
@@ -62,10 +62,10 @@ def drawn(conditioning: Conditioning, side: str, count: int = 400) -> Counter:
     return Counter(conditioning.draw(side, generator(0, i, 0, "prompt")).text for i in range(count))
 
 
-@pytest.mark.parametrize("side", ["", *WORDS])
+@pytest.mark.parametrize("side", ["", *VIEW_WORDS])
 def test_a_prompt_gets_the_word_of_its_side(side: str) -> None:
     found = made([Prompt("a chair")]).draw(side, generator(0, 0, 0, "prompt"))
-    assert found.text == (f"a chair, {WORDS[side]}" if side else "a chair")
+    assert found.text == (f"a chair, {VIEW_WORDS[side]}" if side else "a chair")
     assert found.positive is not None
     assert float(found.positive[0, 0]) == len(found.text) + 1
 
@@ -222,7 +222,7 @@ def test_any_text_that_the_schema_lets_through_can_be_encoded(real: Encoder, tex
     found = encode(real, [Prompt(text)], NOTHING, NOTHING, 0.5, None)
     assert found.tokens is not None
     assert bool(torch.isfinite(found.tokens).all())
-    assert real.longest == 77
+    assert real.max_tokens == 77
     assert (real.length(text) > 77) == (len(text) == 1000) == bool(found.notes)
 
 
@@ -254,4 +254,4 @@ def test_a_whole_clip_scores_prompts(sd21: Path, clip_folder: Path) -> None:
 def test_without_clip_there_is_no_score_and_no_image_embedding(real: Encoder) -> None:
     assert real.alignment(["a"], torch.rand(1, 3, 64, 64)) is None
     assert real.images(torch.rand(1, 3, 64, 64)) is None
-    assert worded(Prompt("a"), "") == "a"
+    assert with_view_word(Prompt("a"), "") == "a"

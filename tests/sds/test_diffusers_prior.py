@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import tiny_sd21
 import torch
-from priors import scale
+from analytic_priors import scale
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError, NumericalError, UsageError

@@ -12,10 +12,10 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.priors.protocol import Condition
 from gsopt.sds.priors.view_conditioned import ViewPrior
-from gsopt.sds.select_prior import Choice, choose, fitting
+from gsopt.sds.select_prior import PriorSelection, restrict_to_scene, select_prior
 
 pytest.importorskip("diffusers")
-DEFAULT = Choice("embedded", 0.2, "the embedded prior (default)")
+DEFAULT = PriorSelection("embedded", 0.2, "the embedded prior (default)")
 
 
 def test_the_folder_is_small_and_says_what_it_is(embedded: Path) -> None:
@@ -41,7 +41,7 @@ def test_nothing_it_learned_from_is_a_test_object(shared_data: Path, embedded: P
 
 @pytest.mark.usefixtures("embedded")
 def test_it_is_the_default_and_answers_the_same_bits_each_time() -> None:
-    assert choose(GuidanceConfig()) == DEFAULT
+    assert select_prior(GuidanceConfig()) == DEFAULT
     first, second = (open_prior("embedded", GuidanceConfig()) for _ in range(2))
     assert isinstance(first, ViewPrior)
     x_t = torch.randn(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
@@ -63,8 +63,8 @@ def test_it_is_the_default_and_answers_the_same_bits_each_time() -> None:
     ],
 )
 def test_it_guides_few_views_of_cut_out_objects_or_where_it_was_asked_for(views, has_alpha, said, guided) -> None:
-    found = fitting(DEFAULT, GuidanceConfig(**said), views, has_alpha)
+    found = restrict_to_scene(DEFAULT, GuidanceConfig(**said), views, has_alpha)
     assert (found.prior == "embedded") == guided
     assert guided or found.weight == 0
-    other = Choice("sd21", 0.2, "as asked for with --prior")
-    assert fitting(other, GuidanceConfig(prior="sd21"), views, has_alpha) == other
+    other = PriorSelection("sd21", 0.2, "as asked for with --prior")
+    assert restrict_to_scene(other, GuidanceConfig(prior="sd21"), views, has_alpha) == other

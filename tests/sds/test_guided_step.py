@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from priors import PixelPrior, gaussian_posterior, knows
+from analytic_priors import PixelPrior, gaussian_posterior, knows
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.background import Background
@@ -16,7 +16,6 @@ from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
-from gsopt.llm_prompts.schema import Prompt
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.sds import policies
@@ -24,6 +23,7 @@ from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.guidance_plan import GuidancePlans
 from gsopt.sds.guidance_step import MAX_FAILURES, Guidance, GuidanceSetup
 from gsopt.sds.observed_render import ObservedRender
+from gsopt.sds.prompts import Prompt
 
 BACKEND = make_backend("cpu", 1)
 SETTINGS = RasterSettings(sh_degree=0)

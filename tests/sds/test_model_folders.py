@@ -1,4 +1,4 @@
-"""What can be wrong with a model: each fault is an InputError or UsageError that names the part and the remedy."""
+"""Defects of a model folder: each fault is an InputError or UsageError that names the part and the remedy."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from priors import NOBODY, PixelPrior, cosine_schedule, gaussian_posterior, knows, scale
+from analytic_priors import NOBODY, PixelPrior, cosine_schedule, gaussian_posterior, knows, scale
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.background import Background

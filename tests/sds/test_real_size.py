@@ -7,7 +7,6 @@ The count computes nothing, but every variant takes seconds: only the first alwa
 from __future__ import annotations
 
 import os
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -21,13 +20,13 @@ import tiny_sd21
 from real_memory import Account
 from real_step import Step, guided_step
 
-from gsopt.sds.priors.stable_diffusion import LARGE, choose_dtype
+from gsopt.sds.priors.stable_diffusion import LARGE_UNET_BYTES, choose_dtype
 
 opt_in = pytest.mark.skipif(os.environ.get("GSOPT_SD21") != "full", reason="opt-in: make test-sd21")
 GPU = 6e9
 """Bytes of the smallest GPU that is to do."""
 CONTEXT = 0.8e9
-"""Of them allowed to CUDA itself and to the workspaces of its convolutions: a guess."""
+"""Share for CUDA itself and the workspaces of its convolutions: a guess."""
 
 
 @cache
@@ -68,7 +67,6 @@ def test_a_tiny_autoencoder_needs_less_still() -> None:
 
 
 def in_the_training_run(folder: Path, tmp_path: Path, *flags: str) -> Step:
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
     from tiny_scenes import write_dataset
 
     scene = write_dataset(tmp_path / "scene", train=4, test=1)
@@ -104,7 +102,7 @@ def test_one_guided_step_at_the_real_size(tmp_path: Path) -> None:
     """Random weights, 512 px, on the CPU, in the number format that gsopt takes there by itself."""
     folder = real_sd21.build(tmp_path / "sd21")
     step = in_the_training_run(folder, tmp_path, "--guidance.size", "512")
-    dtype = choose_dtype("auto", torch.device("cpu"), LARGE)
+    dtype = choose_dtype("auto", torch.device("cpu"), LARGE_UNET_BYTES)
     require_as_counted(step, real_memory.account(512, dtype, sequential=True))
     print(f"{step.cpu_seconds:.0f} CPU s, peak RSS {step.peak_rss / 1e9:.1f} GB")
     assert step.peak_rss < 4e9 * dtype.itemsize

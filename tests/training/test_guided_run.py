@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from analytic_priors import PixelPrior, gaussian_posterior
 from tiny_scenes import tiny_config
 
 from gsopt.config.guidance import GuidanceConfig
@@ -24,9 +25,6 @@ from gsopt.training.guided import start
 from gsopt.training.loop import train
 from gsopt.training.plan import RunPlan
 from gsopt.training.trainer import Trainer
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sds"))
-from priors import PixelPrior, gaussian_posterior
 
 GUIDANCE = GuidanceConfig(
     prior="toy/prior", start=0.2, stop=1.0, every=2, min_uncertainty=0.0, guard_views=0, guidance_scale=1.0
@@ -187,7 +185,7 @@ def test_at_lambda_0_nothing_of_diffusion_is_loaded_and_the_reason_is_told(datas
     import subprocess
 
     script = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "from pathlib import Path\nfrom tiny_scenes import tiny_config\nfrom gsopt.training.loop import train\n"
         f"train(tiny_config(Path({str(dataset)!r}), iterations=2), Path({str(tmp_path / 'run')!r}))\n"
         "assert not {'diffusers', 'transformers', 'huggingface_hub'} & set(sys.modules)"

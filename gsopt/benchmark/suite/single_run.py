@@ -22,11 +22,11 @@ from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import GsoptError, InputError
 from gsopt.events import read_events
-from gsopt.llm_prompts.schema import read_set, write_prompts
 from gsopt.metrics import find_vgg_weights
 from gsopt.results.evaluation import read_metrics
 from gsopt.results.finished_run import open_run
-from gsopt.sds.select_prior import EMBEDDED, choose, fitting
+from gsopt.sds.prompts import read_set, write_prompts
+from gsopt.sds.select_prior import EMBEDDED, restrict_to_scene, select_prior
 
 MAX_ERROR_LINES = 12
 """Number of last lines of a failed run's output in its error."""
@@ -57,10 +57,10 @@ def reason_to_skip(case: Case, context: SuiteContext) -> str | None:
     if not arm_flags.is_guided(case.arm):
         return None
     config = GuidanceConfig(prior=context.prior or "auto")
-    choice = choose(config)
+    choice = select_prior(config)
     if choice.prior is not None and not context.prior:
         views = load_scene(data_config(case, context.root))
-        choice = fitting(choice, config, len(views.train), views.has_alpha)
+        choice = restrict_to_scene(choice, config, len(views.train), views.has_alpha)
     if choice.prior is None:
         return f"the same as ours-0, not guided: {choice.reason}"
     if case.arm not in arm_flags.PROMPT_SOURCES:

@@ -65,11 +65,11 @@ def main(argv: Sequence[str]) -> int:
     from gsopt.data.scene import load_scene
     from gsopt.raster.api import make_backend
     from gsopt.sds.load_prior import open_prior
-    from gsopt.sds.select_prior import choose
+    from gsopt.sds.select_prior import select_prior
     from gsopt.training.guided.compare_prompts import compare_prompts
     from gsopt.training.loop import one_torch_thread
 
-    choice = choose(config.guidance)
+    choice = select_prior(config.guidance)
     assert choice.prior is not None  # a weight was given: a prior that is not there is an error
     prior = open_prior(choice.prior, config.guidance)
     report(f"prior {prior.name}")
@@ -103,7 +103,7 @@ def read_config(flags: Flags) -> TrainConfig:
 
 def read_arms(flags: Flags) -> list[Arm]:
     """No guidance, guidance without prompts, then every file."""
-    from gsopt.llm_prompts.schema import accepted_images, read_prompts
+    from gsopt.sds.prompts import accepted_images, read_prompts
     from gsopt.training.guided.compare_prompts import Arm
 
     if not 1 <= len(flags.files) <= MAX_FILES:

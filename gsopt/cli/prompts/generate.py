@@ -15,9 +15,9 @@ from gsopt.cli.prompts.review import review_file
 from gsopt.errors import UsageError
 
 if TYPE_CHECKING:
-    from gsopt.llm_prompts.generate import Job, Result
-    from gsopt.llm_prompts.reference_images import Drawing
-    from gsopt.llm_prompts.schema import PromptSet
+    from gsopt.llm_prompts.generate import PromptJob, PromptResult
+    from gsopt.llm_prompts.reference_images import ImageSettings
+    from gsopt.sds.prompts import PromptSet
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ def main(argv: Sequence[str]) -> int:
 def write(flags: Flags) -> int:
     """Make the prompts, let the expert see them, write the file."""
     from gsopt.llm_prompts.generate import make_prompts, raw_file, require_model_prompts, write_record
-    from gsopt.llm_prompts.reference_images import Drawing
-    from gsopt.llm_prompts.schema import write_set
+    from gsopt.llm_prompts.reference_images import ImageSettings
+    from gsopt.sds.prompts import write_set
 
     prices = read_prices(flags.price)
-    drawing = Drawing(flags.images_from_prompts, flags.seed, flags.image_steps)
+    settings = ImageSettings(flags.images_from_prompts, flags.seed, flags.image_steps)
     require_writable(flags.output, flags.overwrite)
     job = read_job(flags)
     result = make_prompts(job, report)
@@ -91,7 +91,7 @@ def write(flags: Flags) -> int:
         made = replace(made, made=replace(made.made, raw=raw.name)) if made.made else made
         report(spent(result, prices))
     require_model_prompts(result, job, raw)
-    made = with_pictures(made, flags, drawing)
+    made = with_pictures(made, flags, settings)
     show(made)
     write_set(flags.output, made)
     report(f"{flags.output}: {len(made.prompts)} prompts, tokens by {result.counter.name}")
@@ -101,11 +101,11 @@ def write(flags: Flags) -> int:
     return 0
 
 
-def read_job(flags: Flags) -> Job:
+def read_job(flags: Flags) -> PromptJob:
     """Returns the job that the flags describe."""
-    from gsopt.llm_prompts.generate import Job
+    from gsopt.llm_prompts.generate import PromptJob
 
-    return Job(
+    return PromptJob(
         notes=flags.notes,
         domain=flags.domain,
         category=flags.category,
@@ -123,14 +123,14 @@ def read_job(flags: Flags) -> Job:
     )
 
 
-def with_pictures(made: PromptSet, flags: Flags, drawing: Drawing) -> PromptSet:
+def with_pictures(made: PromptSet, flags: Flags, settings: ImageSettings) -> PromptSet:
     """With the pictures that were asked for; a prior that makes none says why."""
-    if not drawing.count:
+    if not settings.count:
         return made
-    from gsopt.llm_prompts.reference_images import PAGE, illustrate
+    from gsopt.llm_prompts.reference_images import PAGE, generate_images
 
     folder = flags.output.with_name(f"{flags.output.stem}-images")
-    pictures, reason = illustrate(flags.prior, made.prompts, drawing, folder, report)
+    pictures, reason = generate_images(flags.prior, made.prompts, settings, folder, report)
     if reason is not None:
         report(f"no pictures: {reason}")
         return made
@@ -149,19 +149,18 @@ def show(made: PromptSet) -> None:
         report(f"warning: {warning}")
 
 
-def spent(result: Result, prices: tuple[float, float] | None) -> str:
+def spent(result: PromptResult, prices: tuple[float, float] | None) -> str:
     """Requests, tokens, time and cost of the model."""
-    assert result.talk is not None
-    taken, given = result.talk.tokens
+    assert result.conversation is not None
+    taken, given = result.conversation.tokens
     counted = [f"{taken:,} tokens in" if taken is not None else "tokens in unknown"]
     counted.append(f"{given:,} out" if given is not None else "out unknown")
     cost = "cost unknown (give --price IN,OUT)"
     if prices is not None and taken is not None and given is not None:
         cost = f"cost {(taken * prices[0] + given * prices[1]) / 1e6:.4f}"
-    count = len(result.talk.rounds)
-    return (
-        f"language model: {count} answer{'s' * (count != 1)}, {', '.join(counted)}, {result.talk.seconds:.1f} s, {cost}"
-    )
+    count = len(result.conversation.rounds)
+    answers, seconds = f"{count} answer{'s' * (count != 1)}", f"{result.conversation.seconds:.1f} s"
+    return f"language model: {answers}, {', '.join(counted)}, {seconds}, {cost}"
 
 
 def read_prices(text: str) -> tuple[float, float] | None:

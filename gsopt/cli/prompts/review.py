@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from gsopt.errors import UsageError
 
 if TYPE_CHECKING:
-    from gsopt.llm_prompts.schema import PromptSet
+    from gsopt.sds.prompts import PromptSet
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Flags:
 
 def main(argv: Sequence[str]) -> int:
     """Review a file; the exit code."""
-    from gsopt.llm_prompts.schema import read_set
+    from gsopt.sds.prompts import read_set
 
     flags = tyro.cli(Flags, prog="gsopt prompts review", args=list(argv))
     return review_file(flags.file, read_set(flags.file))
@@ -34,12 +34,12 @@ def main(argv: Sequence[str]) -> int:
 
 def review_file(path: Path, everything: PromptSet) -> int:
     """Ask about every prompt, then replace the file. UsageError when it is left before the end: nothing is changed."""
-    from gsopt.llm_prompts.review import Abandoned, review
-    from gsopt.llm_prompts.schema import write_set
+    from gsopt.llm_prompts.review import ReviewAborted, review
+    from gsopt.sds.prompts import write_set
 
     try:
         reviewed = review(everything, input, print)
-    except Abandoned as left:
+    except ReviewAborted as left:
         raise UsageError(
             f"The review was left before its end; {path} is as it was. Start again: gsopt prompts review {path}"
         ) from left

@@ -1,4 +1,4 @@
-"""The low-rank change of a U-Net while it is trained, by peft, and its files."""
+"""Attaches a trainable low-rank change (LoRA) to a U-Net with peft, and writes its files."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gsopt.sds.priors.lora import ADAPTER, CONFIG, PREFIX, WEIGHTS
 
 NAME = "default"
 TARGETS = ["to_q", "to_k", "to_v", "to_out.0"]
-"""The attention layers' matrices: what Stable Diffusion's LoRAs change since Ryu 2022."""
+"""Matrices of the attention layers, which LoRAs of Stable Diffusion change since Ryu 2022."""
 PIPELINE = "pytorch_lora_weights.safetensors"
-"""What `load_lora_weights` of diffusers' pipelines looks for."""
+"""File name that `load_lora_weights` of diffusers' pipelines expects."""
 
 
 def attach(unet: Any, rank: int, seed: int) -> None:
-    """Give every attention matrix a trainable change of this rank, float32, zero at first."""
+    """Adds a trainable float32 change of this rank to every attention matrix, zero at first."""
     peft = require("peft", "sds", "Training a LoRA")
     config = peft.LoraConfig(r=rank, lora_alpha=rank, target_modules=TARGETS)
     with torch.random.fork_rng(devices=[]):
@@ -33,7 +33,7 @@ def attach(unet: Any, rank: int, seed: int) -> None:
 
 
 def save_adapter(unet: Any, folder: Path) -> None:
-    """`lora/` as peft reads it, and one file as diffusers' pipelines read it. alpha = r: every tool scales by 1."""
+    """Writes `lora/` for peft and one file for diffusers' pipelines. alpha = r: every tool scales by 1."""
     peft = require("peft", "sds", "Training a LoRA")
     learned: dict[str, Tensor] = peft.get_peft_model_state_dict(unet, adapter_name=NAME)
     learned = {name: value.detach().cpu().contiguous() for name, value in learned.items()}

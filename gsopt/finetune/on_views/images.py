@@ -1,4 +1,4 @@
-"""The images Stable Diffusion is trained on: input views of posed scenes, or plain images; and their variants."""
+"""Training images of Stable Diffusion: input views of posed scenes or plain images, and their variants."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from gsopt.data.images import IMAGE_FORMATS, read_header, read_pixels
 from gsopt.data.scene import View, is_posed, load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report
-from gsopt.finetune.captions import said_of
-from gsopt.finetune.on_views.training_config import Preparation
-from gsopt.sds.conditioning import NEUTRAL
+from gsopt.finetune.captions import read_captions
+from gsopt.finetune.on_views.training_config import ImagePreparation
+from gsopt.sds.conditioning import NEUTRAL_PROMPT
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.protocol import Images
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-MOST = 4096
-"""Variants of images: each is kept as latents, 150 kB at 768 px."""
+MAX_VARIANTS = 4096
+"""Limit on the variants of all images, each kept as latents, 150 kB at 768 px."""
 LUMA = (0.299, 0.587, 0.114)
 ORIENTATION = 274
-"""EXIF tag of how a camera was held."""
+"""EXIF tag of the camera's orientation."""
 UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -42,34 +42,34 @@ UPRIGHT = {
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One image, read when it is needed."""
+class TrainingImage:
+    """One image, read on demand."""
 
     name: str
     text: str
-    """What is said of it."""
+    """Its prompt."""
     side: int
     """The shorter one, px."""
     pixels: Callable[[], UInt8[Tensor, "H W C"]]
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """Which views of a posed scene: as `gsopt train` chooses them, for the others are what a run is judged by."""
+class ViewSelection:
+    """Input views of a posed scene, as in `gsopt train`: the other views evaluate a run."""
 
     views: int | None = None
     view_ids: tuple[int, ...] | None = None
     eval: bool = False
 
 
-def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, report: Report) -> list[Picture]:
-    """Input views of posed scenes, images of folders, and images. InputError where there is none.
+def find_images(roots: Sequence[Path], chosen: ViewSelection, prompt: str, report: Report) -> list[TrainingImage]:
+    """Returns input views of posed scenes, images of folders, and images. Raises InputError when there is none.
 
-    `prompt` is said of all; where it is empty, the scene's caption, or what fits any object.
+    `prompt` describes all of them; when it is empty, the scene's caption or a neutral prompt does.
     """
     if not roots:
-        raise UsageError("No images were given to learn from. Give a posed scene, a folder of images, or images.")
-    found: list[Picture] = []
+        raise UsageError("No images were given to train on. Give a posed scene, a folder of images, or images.")
+    found: list[TrainingImage] = []
     for root in roots:
         if root.is_dir() and is_posed(root):
             found += _views(root, chosen, prompt, report)
@@ -80,23 +80,23 @@ def find_pictures(roots: Sequence[Path], chosen: Chosen, prompt: str, report: Re
             )
         else:
             found += [_plain(path, prompt) for path in _files(root)]
-    names = [picture.name for picture in found]
+    names = [image.name for image in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UsageError(f"Two images are called {twice}. Rename a folder, or name each only once.")
     return found
 
 
-def _views(root: Path, chosen: Chosen, prompt: str, report: Report) -> list[Picture]:
+def _views(root: Path, chosen: ViewSelection, prompt: str, report: Report) -> list[TrainingImage]:
     scene = load_scene(DataConfig(str(root), chosen.views, chosen.view_ids, eval=chosen.eval))
     for warning in scene.warnings:
         report(warning)
-    text = prompt or next(iter(said_of(root)), NEUTRAL)
+    text = prompt or next(iter(read_captions(root)), NEUTRAL_PROMPT)
 
-    def picture(view: View) -> Picture:
-        return Picture(f"{root.name}/{view.name}", text, min(view.camera.width, view.camera.height), view.pixels)
+    def image(view: View) -> TrainingImage:
+        return TrainingImage(f"{root.name}/{view.name}", text, min(view.camera.width, view.camera.height), view.pixels)
 
-    return [picture(view) for view in scene.train]
+    return [image(view) for view in scene.train]
 
 
 def _files(root: Path) -> list[Path]:
@@ -113,40 +113,42 @@ def _files(root: Path) -> list[Path]:
     return found
 
 
-def _plain(path: Path, prompt: str) -> Picture:
+def _plain(path: Path, prompt: str) -> TrainingImage:
     width, height, _ = read_header(path)
-    return Picture(f"{path.parent.name}/{path.name}", prompt or NEUTRAL, min(width, height), lambda: read_upright(path))
+    return TrainingImage(
+        f"{path.parent.name}/{path.name}", prompt or NEUTRAL_PROMPT, min(width, height), lambda: read_upright(path)
+    )
 
 
 def read_upright(path: Path) -> UInt8[Tensor, "H W C"]:
-    """A plain image, turned as its EXIF tag says: unlike views it has no pose that refers to the stored rows."""
+    """Reads a plain image in its EXIF orientation; it has no pose that refers to the stored rows, as views have."""
     pixels = read_pixels(path)
     try:
         with Image.open(path, formats=IMAGE_FORMATS) as image:
             turn = UPRIGHT.get(image.getexif().get(ORIENTATION, 1))
-    except Exception:  # a broken tag tells nothing
+    except Exception:  # a broken tag is ignored
         turn = None
     return pixels if turn is None else torch.from_numpy(np.array(Image.fromarray(pixels.numpy()).transpose(turn)))
 
 
 def prepared(
-    pixels: UInt8[Tensor, "H W C"], size: int, how: Preparation, variant: int, random: torch.Generator
+    pixels: UInt8[Tensor, "H W C"], size: int, preparation: ImagePreparation, variant: int, random: torch.Generator
 ) -> Images:
-    """One variant, the plain middle square for 0: stretched, jittered, put on white, cut out, mirrored."""
+    """Returns one variant: stretched, jittered, on white, cropped, mirrored; variant 0 is the plain center square."""
     planes = pixels.permute(2, 0, 1).float() / 255
     rgb, alpha = planes[:3], planes[3:] if len(planes) == 4 else torch.ones_like(planes[:1])
-    if how.stretch:
-        rgb = stretched(rgb, alpha, how.stretch)
-    if variant and how.jitter:
-        rgb = jittered(rgb, how.jitter, random)
-    square = _cut(rgb * alpha + (1 - alpha), how.crop if variant else 0.0, random)
+    if preparation.stretch:
+        rgb = stretched(rgb, alpha, preparation.stretch)
+    if variant and preparation.jitter:
+        rgb = jittered(rgb, preparation.jitter, random)
+    square = _cut(rgb * alpha + (1 - alpha), preparation.crop if variant else 0.0, random)
     square = torch.nn.functional.interpolate(square[None], (size, size), mode="bilinear", antialias=True).clamp(0, 1)
-    return square.flip(3) if how.flip and variant % 2 else square
+    return square.flip(3) if preparation.flip and variant % 2 else square
 
 
 def stretched(rgb: Float[Tensor, "3 H W"], alpha: Float[Tensor, "1 H W"], percent: float) -> Float[Tensor, "3 H W"]:
-    """Contrast such that `percent` of the visible values are clipped at either end. One curve for all channels keeps
-    hues; an image of one value is left as it is."""
+    """Stretches contrast so that `percent` of the visible values are clipped at either end. One curve for all channels
+    keeps hues; a constant image is unchanged."""
     visible = rgb[:, alpha[0] > 0.5].numpy()
     if visible.size == 0:
         return rgb
@@ -155,16 +157,16 @@ def stretched(rgb: Float[Tensor, "3 H W"], alpha: Float[Tensor, "1 H W"], percen
 
 
 def jittered(rgb: Float[Tensor, "3 H W"], share: float, random: torch.Generator) -> Float[Tensor, "3 H W"]:
-    """Brightness, contrast and saturation times 1 ± share, each."""
-    brightness, contrast, saturation = (1 + share * (2 * torch.rand(3, generator=random) - 1)).tolist()
+    """Scales brightness, contrast and saturation by 1 ± share each."""
+    brightness, contrastive_loss, saturation = (1 + share * (2 * torch.rand(3, generator=random) - 1)).tolist()
     rgb = rgb * brightness
-    rgb = (rgb - rgb.mean()) * contrast + rgb.mean()
-    grey = (rgb * torch.tensor(LUMA)[:, None, None]).sum(0)
-    return ((rgb - grey) * saturation + grey).clamp(0, 1)
+    rgb = (rgb - rgb.mean()) * contrastive_loss + rgb.mean()
+    gray = (rgb * torch.tensor(LUMA)[:, None, None]).sum(0)
+    return ((rgb - gray) * saturation + gray).clamp(0, 1)
 
 
 def _cut(planes: Float[Tensor, "3 H W"], crop: float, random: torch.Generator) -> Float[Tensor, "3 s s"]:
-    """A square: the middle one, or one up to `crop` smaller anywhere."""
+    """Returns the center square, or a random square smaller by up to `crop`."""
     height, width = planes.shape[1:]
     side, at = min(height, width), torch.tensor([0.5, 0.5])
     if crop:
@@ -174,7 +176,11 @@ def _cut(planes: Float[Tensor, "3 H W"], crop: float, random: torch.Generator) -
     return planes[:, top : top + side, left : left + side]
 
 
-def variants(pictures: Sequence[Picture], row: int, size: int, how: Preparation, seed: int) -> list[Images]:
-    """All variants of one picture; each depends on nothing but its number."""
-    pixels = pictures[row].pixels()
-    return [prepared(pixels, size, how, v, generator(seed, row, v, "variant")) for v in range(how.count)]
+def variants(
+    images: Sequence[TrainingImage], row: int, size: int, preparation: ImagePreparation, seed: int
+) -> list[Images]:
+    """Returns all variants of one image; each depends on its number only."""
+    pixels = images[row].pixels()
+    return [
+        prepared(pixels, size, preparation, v, generator(seed, row, v, "variant")) for v in range(preparation.count)
+    ]

@@ -1,4 +1,4 @@
-"""CLIP through transformers: words and pictures to what a prior attends to, and how well the two agree.
+"""CLIP through transformers: encodes text and images as tokens of a prior, and measures their alignment.
 
 Every model is loaded with an explicit dtype (transformers takes the checkpoint's otherwise) and from safetensors only.
 """
@@ -20,12 +20,13 @@ from gsopt._optional import require
 from gsopt.errors import InputError
 from gsopt.sds.priors.protocol import Images
 
-LONGEST = 77
-"""Tokens of CLIP's text models."""
-MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-"""Of CLIP's training images (Radford et al. 2021); a preprocessor_config.json may say otherwise."""
-ROWS = 8
-"""Texts or images that are encoded at once."""
+MAX_TOKENS = 77
+"""Token limit of CLIP's text models."""
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+"""Mean and standard deviation of CLIP's training images (Radford et al. 2021), unless preprocessor_config.json
+differs."""
+ROWS_AT_ONCE = 8
+"""Number of texts or images encoded at once."""
 
 
 @dataclass(frozen=True)
@@ -34,18 +35,18 @@ class TextTower:
 
     tokenizer: Any
     model: Any
-    longest: int
+    max_tokens: int
 
     def ids(self, texts: Sequence[str]) -> Tensor:
-        """Token numbers, padded and cut to the model's length."""
+        """Returns token ids, padded and truncated to the model's length."""
         encoded = self.tokenizer(
-            list(texts), padding="max_length", max_length=self.longest, truncation=True, return_tensors="pt"
+            list(texts), padding="max_length", max_length=self.max_tokens, truncation=True, return_tensors="pt"
         )
         return encoded.input_ids
 
     def hidden(self, texts: Sequence[str]) -> Float[Tensor, "n L D"]:
-        """Last hidden states, as Stable Diffusion attends to them."""
-        chunks = [texts[i : i + ROWS] for i in range(0, len(texts), ROWS)]
+        """Returns the last hidden states, as Stable Diffusion attends to them."""
+        chunks = [texts[i : i + ROWS_AT_ONCE] for i in range(0, len(texts), ROWS_AT_ONCE)]
         return torch.cat([self.model(self.ids(chunk)).last_hidden_state.float() for chunk in chunks])
 
 
@@ -59,15 +60,15 @@ class ImageTower:
     std: tuple[float, ...]
 
     def embeddings(self, images: Images) -> Float[Tensor, "n E"]:
-        """In CLIP's joint space, not normalised."""
+        """Returns embeddings in CLIP's joint space, not normalized."""
         mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (self.mean, self.std))
         resized = torch.nn.functional.interpolate(images, (self.size,) * 2, mode="bicubic", antialias=True)
         pixels = (resized.clamp(0, 1) - mean) / std
-        return torch.cat([self.model(chunk).image_embeds.float() for chunk in pixels.split(ROWS)])
+        return torch.cat([self.model(chunk).image_embeds.float() for chunk in pixels.split(ROWS_AT_ONCE)])
 
 
 class ClipEncoder:
-    """A prior's own text encoder, its image encoder when it has one, and a whole CLIP for alignment when given."""
+    """A prior's text encoder, its image encoder if any, and optionally a whole CLIP for alignment."""
 
     def __init__(
         self,
@@ -78,19 +79,19 @@ class ClipEncoder:
         *,
         whole_words: bool = False,
     ) -> None:
-        """`whole_words`: the tokenizer has one token for every word that was met, as `gsopt finetune` makes them."""
+        """`whole_words`: the tokenizer has one token for every known word, as those of `gsopt finetune` have."""
         self.name, self._whole_words = name, whole_words
         self._text, self._image, self._joint = text, image, joint
 
     @property
-    def longest(self) -> int:
-        return self._text.longest
+    def max_tokens(self) -> int:
+        return self._text.max_tokens
 
     def length(self, text: str) -> int:
         return len(self._text.tokenizer(text, truncation=False).input_ids)
 
     def unknown_words(self, text: str) -> list[str]:
-        """Those that a tokenizer of whole words spells out; a tokenizer of pieces does not tell."""
+        """Returns the words that a tokenizer of whole words splits; empty for other tokenizers."""
         if not self._whole_words:
             return []
         tokenizer = self._text.tokenizer
@@ -119,19 +120,19 @@ class JointClip:
     image: ImageTower
 
     def cosine(self, texts: Sequence[str], images: Images) -> Float[Tensor, "n m"]:
-        """Of every text with every image."""
+        """Returns the cosine of every text with every image."""
         words = self.text.model(self.text.ids(texts)).text_embeds.float()
         pictures = self.image.embeddings(images)
         return torch.nn.functional.normalize(words, dim=-1) @ torch.nn.functional.normalize(pictures, dim=-1).T
 
 
 def load_text_tower(tokenizer: Path, model: Path, dtype: torch.dtype, *, projected: bool = False) -> TextTower:
-    """From the folders of a tokenizer and of a CLIPTextModel."""
+    """Loads the folders of a tokenizer and of a CLIPTextModel."""
     transformers = _transformers()
     kind = transformers.CLIPTextModelWithProjection if projected else transformers.CLIPTextModel
     tokens = _loaded(transformers.CLIPTokenizer, tokenizer)
     network = _loaded(kind, model, dtype=dtype, use_safetensors=True)
-    limit = min(int(tokens.model_max_length), int(network.config.max_position_embeddings), LONGEST)
+    limit = min(int(tokens.model_max_length), int(network.config.max_position_embeddings), MAX_TOKENS)
     if len(tokens) > network.config.vocab_size:
         raise InputError(
             f"The tokenizer {tokenizer} knows {len(tokens)} tokens, the text encoder {model} only "
@@ -141,29 +142,29 @@ def load_text_tower(tokenizer: Path, model: Path, dtype: torch.dtype, *, project
 
 
 def load_image_tower(model: Path, preprocessor: Path, dtype: torch.dtype) -> ImageTower:
-    """From the folder of a CLIPVisionModelWithProjection; `preprocessor` may hold a preprocessor_config.json."""
+    """Loads the folder of a CLIPVisionModelWithProjection; `preprocessor` may hold a preprocessor_config.json."""
     network = _loaded(_transformers().CLIPVisionModelWithProjection, model, dtype=dtype, use_safetensors=True)
-    mean, std = _normalisation(preprocessor / "preprocessor_config.json")
+    mean, std = _normalization(preprocessor / "preprocessor_config.json")
     return ImageTower(network.eval().requires_grad_(False), int(network.config.image_size), mean, std)
 
 
 def load_joint_clip(folder: Path, dtype: torch.dtype) -> JointClip:
-    """From one folder that holds a whole CLIPModel with its tokenizer."""
+    """Loads a folder with a whole CLIPModel and its tokenizer."""
     return JointClip(load_text_tower(folder, folder, dtype, projected=True), load_image_tower(folder, folder, dtype))
 
 
-def _normalisation(file: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _normalization(file: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     if not file.is_file():
-        return MEAN, STD
+        return CLIP_MEAN, CLIP_STD
     try:
         document = json.loads(file.read_bytes()[: 1 << 20])
         return tuple(map(float, document["image_mean"])), tuple(map(float, document["image_std"]))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return MEAN, STD
+        return CLIP_MEAN, CLIP_STD
 
 
 def _transformers() -> Any:
-    """Without its reports on weights of the half of a CLIP that is not wanted."""
+    """Imports transformers without its warnings on unused weights."""
     transformers = require("transformers", "sds", "Encoding prompts")
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()

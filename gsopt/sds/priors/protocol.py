@@ -1,8 +1,8 @@
-"""What a diffusion prior is to the rest of gsopt: `denoise(x_t, t, conditions) -> x0_hat`.
+"""The interface of a diffusion prior: `denoise(x_t, t, conditions) -> x0_hat`.
 
-Two kinds stand behind it. Stable Diffusion works on latents, takes text and image tokens and predicts eps or v; the
+Two kinds implement it. Stable Diffusion works on latents, takes text and image tokens and predicts eps or v; the
 view-conditioned prior works on pixels, takes the current render and posed reference views, and predicts x0. Each reads
-from a `Condition` what it knows and ignores the rest. Policies, classifier-free guidance and training see x0 only.
+from a `Condition` the fields it supports. Policies, classifier-free guidance and training use x0 only.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Images = Float[Tensor, "B 3 S S"]
 
 @dataclass(frozen=True)
 class References:
-    """Input views as a view-conditioned prior sees them."""
+    """Input views as references of a view-conditioned prior."""
 
     images: Float[Tensor, "K 3 S S"]
     """0..1, on the background."""
     alphas: Float[Tensor, "K 1 S S"]
-    """1 where the view has no alpha."""
+    """Alphas; 1 for a view without alpha."""
     cameras: Cameras
     """K of them, S x S px."""
     depths: Float[Tensor, "K S S"] | None = None
@@ -39,25 +39,25 @@ class References:
 
 @dataclass(frozen=True)
 class Condition:
-    """What one row of a call may know about its image. None: not known (in training: dropped out)."""
+    """Conditions on one image of a batch; `None` = absent (in training: dropped out)."""
 
     tokens: Float[Tensor, "L D"] | None = None
-    """For cross-attention: hidden states of the prompt, then image tokens."""
+    """Tokens for cross-attention: hidden states of the prompt, then image tokens."""
     class_embedding: Float[Tensor, "E"] | None = None
     """SD 2.1-unCLIP's image embedding with its noise level."""
     render: Float[Tensor, "4 S S"] | None = None
     """The render to be improved, color on the background and alpha, aligned with the image pixel by pixel."""
     depth: Float[Tensor, "S S"] | None = None
-    """Expected z of the render, 0 where there is nothing."""
+    """Expected z of the render, 0 on empty pixels."""
     uncertainty: Float[Tensor, "S S"] | None = None
-    """How free the input views left each pixel of the render, 0 to 1."""
+    """Uncertainty of each pixel of the render, given the input views, 0 to 1."""
     camera: Cameras | None = None
     """The camera of the image, S x S px."""
     references: References | None = None
 
 
 class Encoder(Protocol):
-    """Turns words and pictures into what a prior attends to. Used once, then dropped."""
+    """Encodes text and images as tokens of a prior. Used once, then released."""
 
     name: str
 
@@ -70,52 +70,52 @@ class Encoder(Protocol):
         ...
 
     def unknown_words(self, text: str) -> list[str]:
-        """Words of a text that it never met, as far as it can tell."""
+        """Words of a text outside its vocabulary, as far as it can determine."""
         ...
 
     @property
-    def longest(self) -> int:
-        """Tokens that are read; what a text has beyond is cut off."""
+    def max_tokens(self) -> int:
+        """Token limit; longer texts are truncated."""
         ...
 
     def images(self, images: Images) -> Float[Tensor, "n E"] | None:
-        """CLIP image embeddings, not normalised; None where there is no image encoder."""
+        """Returns CLIP image embeddings, not normalized; without an image encoder `None`."""
         ...
 
     def alignment(self, texts: Sequence[str], images: Images) -> Float[Tensor, "n m"] | None:
-        """Cosine of every text with every image in CLIP's joint space; None where there is no such space."""
+        """Returns the cosine of every text with every image in CLIP's joint space; without one `None`."""
         ...
 
 
 class Prior(Protocol):
-    """A diffusion model that judges images."""
+    """A diffusion model of images."""
 
     name: str
-    """For people: what was loaded, with its prediction type."""
+    """Displayed name of the model, with its prediction type."""
     size: int
-    """Side of the square images it was made for, px."""
+    """Side of its square images, px."""
     schedule: NoiseSchedule
     x0_limit: float | None
-    """Largest |x0| there is (1 for pixels in [-1, 1]); None for latents."""
+    """Bound of |x0| (1 for pixels in [-1, 1]), `None` for latents."""
     class_embedding_width: int | None
-    """E of `Condition.class_embedding` (half of what unCLIP's network takes); None where it takes none."""
+    """E of `Condition.class_embedding` (half the input of unCLIP's network), or `None`."""
     aligned: bool
-    """Whether it looks at the render, its depth and the references; else these are not made for it."""
+    """True if it uses the render, its depth and the references, which are not computed otherwise."""
 
     def encode(self, images: Images) -> Latents:
-        """Into the model's space, float32. Differentiable."""
+        """Encodes into the model's space, float32. Differentiable."""
         ...
 
     def decode(self, x0: Latents) -> Images:
-        """Back to pixels, no gradient."""
+        """Decodes to pixels, no gradient."""
         ...
 
     def denoise(self, x_t: Latents, t: Int[Tensor, "B"], conditions: Sequence[Condition]) -> Latents:
-        """One call of the network, one condition per row: its estimate of x0, float32, no gradient."""
+        """Calls the network with one condition per row; returns its estimate of x0, float32, no gradient."""
         ...
 
     def encoder(self) -> Encoder | None:
-        """Loads what turns words and pictures into tokens; None for a prior that takes none."""
+        """Loads the encoder of text and images, or returns `None` for a prior without one."""
         ...
 
 
@@ -125,12 +125,12 @@ class Pair:
 
     positive: Condition
     negative: Condition
-    """Without the prompt and the references, or with the negative prompt; the render and the camera stay."""
+    """Condition without prompt and references, or with the negative prompt, but with the render and the camera."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How the halves are put together."""
+    """Parameters of combining the two halves."""
 
     guidance: float = 1.0
     rescale: float = 0.0
@@ -143,7 +143,7 @@ def guided_x0(prior: Prior, x_t: Latents, t: int, pair: Pair, scale: Scale) -> L
     """Classifier-free guidance (Ho & Salimans 2022) on the estimate of x0: x_u + s (x_c - x_u).
 
     At fixed x_t and t, eps and v are affine in x0, so this is eps_u + s (eps_c - eps_u) exactly. s = 1 and s = 0 call
-    the model with one row. Raises NumericalError when the model answers with anything that is not finite.
+    the model with one row. Raises NumericalError when the prediction is not finite.
     """
     if scale.guidance in (0.0, 1.0):
         only = pair.positive if scale.guidance == 1 else pair.negative
@@ -166,7 +166,7 @@ def _halves(prior: Prior, x_t: Latents, t: int, pair: Pair, sequential: bool) ->
 
 
 def _rescaled(x0: Latents, conditional: Latents, share: float) -> Latents:
-    """Lin et al. 2024, eq. 15 and 16, on x0 and about its mean: without the latter a white background would darken."""
+    """Lin et al. 2024, eq. 15 and 16, on x0 and about its mean: otherwise a white background would darken."""
     if share == 0:
         return x0
     axes = (1, 2, 3)
@@ -180,6 +180,6 @@ def _finite(prior: Prior, x0: Latents, t: int) -> Latents:
         return x0
     index = torch.nonzero(~torch.isfinite(x0))[0].tolist()
     raise NumericalError(
-        f"The prior {prior.name} answered {x0[tuple(index)].item()} at index {index} for step t={t}. "
+        f"The prior {prior.name} predicted {x0[tuple(index)].item()} at index {index} for step t={t}. "
         "Half precision is the usual cause: choose --guidance.dtype float32 or bfloat16."
     )

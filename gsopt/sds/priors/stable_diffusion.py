@@ -1,8 +1,8 @@
 """Stable Diffusion 1 and 2 behind the `Prior` interface: any diffusers folder with a U-Net, a VAE and a CLIP.
 
-The networks are loaded when first needed, after the text encoder has done its work and is gone. No gradient passes the
-U-Net; through the VAE's encoder it passes block by block, each recomputed (Chen et al. 2016), so that memory holds one
-block's activations instead of all.
+The networks are loaded on first use, after the text encoder is released. No gradient passes through the U-Net; the
+VAE's encoder recomputes its blocks in the backward pass (Chen et al. 2016), so that memory holds one block's
+activations.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from gsopt.sds.priors import clip, lora
 from gsopt.sds.priors.folder import DiffusersFolder, check_weights
 from gsopt.sds.priors.protocol import Condition, Encoder, Images
 
-LARGE = 1 << 30
-"""Bytes of U-Net weights on disk from which on a CPU computes in bfloat16."""
+LARGE_UNET_BYTES = 1 << 30
+"""Size of U-Net weights on disk, bytes, from which on a CPU computes in bfloat16."""
 
 
-RESIDUAL = "ResnetBlock2D"
-"""What nearly all memory of an autoencoder's encoder is in."""
+RESIDUAL_BLOCK = "ResnetBlock2D"
+"""Type of the blocks that hold nearly all memory of an autoencoder's encoder."""
 
 
 class DiffusersPrior:
@@ -58,7 +58,7 @@ class DiffusersPrior:
 
     @cached_property
     def unet(self) -> Any:
-        """The denoiser, frozen, with what was learned beside it."""
+        """The denoiser, frozen, with its LoRA merged."""
         diffusers = require("diffusers", "sds", "Guidance by Stable Diffusion")
         unet = _loaded(diffusers.UNet2DConditionModel, self.folder.path / "unet", self.dtype)
         if self.folder.adapter is not None:
@@ -67,7 +67,7 @@ class DiffusersPrior:
 
     @cached_property
     def vae(self) -> Any:
-        """Pixels to latents and back, frozen; its encoder recomputes its blocks in the backward pass."""
+        """The autoencoder, frozen; its encoder recomputes its blocks in the backward pass."""
         diffusers = require("diffusers", "sds", "Guidance by Stable Diffusion")
         tiny = self._tiny_vae or self.folder.vae["_class_name"] == "AutoencoderTiny"
         path = find_part(self._tiny_vae) if self._tiny_vae else self.folder.path / "vae"
@@ -82,7 +82,7 @@ class DiffusersPrior:
         return self._placed(vae)
 
     def encode(self, images: Images) -> Latents:
-        """The mean of the VAE's distribution: sampling it would only add variance."""
+        """Returns the mean of the VAE's distribution: sampling it would only add variance."""
         encoded = self.vae.encode((2 * images - 1).to(self.device, self.dtype))
         latents = encoded.latents if hasattr(encoded, "latents") else encoded.latent_dist.mean
         shift = getattr(self.vae.config, "shift_factor", None) or 0.0
@@ -90,14 +90,14 @@ class DiffusersPrior:
 
     @torch.no_grad()
     def decode(self, x0: Latents) -> Images:
-        """Through the VAE's decoder, on the CPU, clamped."""
+        """Decodes with the VAE; the result is clamped and on the CPU."""
         shift = getattr(self.vae.config, "shift_factor", None) or 0.0
         latents = x0.to(self.device) / self.vae.config.scaling_factor + shift
         return (self.vae.decode(latents.to(self.dtype)).sample.float().cpu() / 2 + 0.5).clamp(0, 1)
 
     @torch.no_grad()
     def denoise(self, x_t: Latents, t: Int[Tensor, "B"], conditions: Sequence[Condition]) -> Latents:
-        """One call of the U-Net; its answer, whatever it predicts, as x0."""
+        """Calls the U-Net once and converts its prediction to x0."""
         tokens, mask = padded_tokens([condition.tokens for condition in conditions])
         output = self.unet(
             x_t.to(self.device, self.dtype),
@@ -109,7 +109,7 @@ class DiffusersPrior:
         return x0_from(output.to(x_t), x_t, self.schedule.signal(t, x_t), self.prediction)
 
     def encoder(self) -> Encoder | None:
-        """The folder's text encoder and, where there is one, its image encoder; --guidance.clip adds a whole CLIP."""
+        """Loads the folder's text encoder and its image encoder, if any; --guidance.clip adds a whole CLIP."""
         if not self.folder.takes_text:
             return None
         path, dtype = self.folder.path, torch.float32
@@ -143,16 +143,16 @@ def recompute(vae: Any) -> None:
     """
     again = partial(torch.utils.checkpoint.checkpoint, use_reentrant=False, preserve_rng_state=False)
     for block in vae.encoder.modules():
-        if type(block).__name__ == RESIDUAL:
+        if type(block).__name__ == RESIDUAL_BLOCK:
             block.forward = partial(again, block.forward)
 
 
 def padded_tokens(
     rows: Sequence[Float[Tensor, "L D"] | None],
 ) -> tuple[Float[Tensor, "B L D"] | None, Float[Tensor, "B L"] | None]:
-    """Rows of tokens as one batch; the mask (1 = token) only where their lengths differ.
+    """Returns rows of tokens as one batch, with a mask (1 = token) if their lengths differ.
 
-    Image tokens stand in the positive half alone, so the negative one is shorter: what pads it must not be attended to.
+    Only the positive half has image tokens; the padding of the shorter negative half must not be attended to.
     """
     given = [row for row in rows if row is not None]
     if len(given) != len(rows):
@@ -164,7 +164,7 @@ def padded_tokens(
 
 
 def read_schedule(folder: DiffusersFolder) -> tuple[Prediction, NoiseSchedule]:
-    """What the network predicts and its noise schedule, from scheduler_config.json."""
+    """Reads the prediction type and the noise schedule from scheduler_config.json."""
     prediction = folder.scheduler.get("prediction_type", "epsilon")
     if prediction not in PREDICTIONS:
         raise InputError(
@@ -179,7 +179,7 @@ def read_schedule(folder: DiffusersFolder) -> tuple[Prediction, NoiseSchedule]:
 
 
 def choose_device(name: str) -> torch.device:
-    """`auto`: the GPU when there is one. UsageError for a GPU that is not there."""
+    """Returns the device; `auto` prefers a GPU. Raises UsageError for a missing GPU."""
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise UsageError("`--guidance.device` is cuda, but torch finds no GPU. Use cpu, or install torch for CUDA.")
@@ -187,8 +187,8 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_dtype(name: str, device: torch.device, unet_bytes: int) -> torch.dtype:
-    """`auto`: float16 on a GPU; on a CPU, which has no arithmetic for it, bfloat16 for large models where torch has
-    kernels for it, else float32."""
+    """Returns the dtype. `auto`: float16 on a GPU; on a CPU bfloat16 for large models if torch has fast kernels for it,
+    else float32."""
     if device.type == "cpu" and name == "float16":
         raise UsageError(
             "`--guidance.dtype` float16 does not work on a CPU. Use bfloat16 (the same memory), float32 or auto: the "
@@ -198,17 +198,17 @@ def choose_dtype(name: str, device: torch.device, unet_bytes: int) -> torch.dtyp
         return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
     if device.type != "cpu":
         return torch.float16
-    return torch.bfloat16 if unet_bytes >= LARGE and has_bfloat16() else torch.float32
+    return torch.bfloat16 if unet_bytes >= LARGE_UNET_BYTES and has_bfloat16() else torch.float32
 
 
 def has_bfloat16() -> bool:
-    """Whether this CPU computes in bfloat16 at a useful speed. Without AVX-512 torch falls back to loops: a convolution
-    of SD 2.1 takes a hundred times as long as in float32 (measured on AVX2)."""
+    """True if this CPU computes in bfloat16 fast enough. Without AVX-512 a convolution of SD 2.1 takes a hundred times
+    as long as in float32 (measured on AVX2)."""
     return torch.backends.cpu.get_cpu_capability() == "AVX512"
 
 
 def find_part(name: str) -> Path:
-    """A folder with one model (a tiny autoencoder, a CLIP), local or from the hub."""
+    """Finds a folder with one model (a tiny autoencoder, a CLIP), local or from the hub."""
     path = Path(name).expanduser()
     if not path.is_dir():
         hub = require("huggingface_hub", "sds", "Fetching a model from the hub")
@@ -224,7 +224,7 @@ def find_part(name: str) -> Path:
 
 
 def _side(folder: DiffusersFolder) -> int:
-    """Pixels of the images the model was trained on."""
+    """Returns the side of the model's training images, px."""
     sample = folder.unet.get("sample_size") or 64
     sample = max(sample) if isinstance(sample, list) else sample
     return int(sample) * 2 ** (len(folder.vae.get("block_out_channels", [0] * 4)) - 1)

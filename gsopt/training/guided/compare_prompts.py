@@ -13,11 +13,11 @@ from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
 from gsopt.events import Report
-from gsopt.llm_prompts.schema import Prompt
 from gsopt.metrics import capped_psnr
 from gsopt.raster.backend import Backend
 from gsopt.sds.guidance_step import GuidanceSetup
 from gsopt.sds.priors.protocol import Prior
+from gsopt.sds.prompts import Prompt
 from gsopt.training.guided.guard import HeldOutView, short_config, short_run, spread_views, without
 from gsopt.training.guided.references import encoded, front_camera, read_references
 from gsopt.training.mirror_images import with_mirrors

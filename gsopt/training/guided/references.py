@@ -15,10 +15,10 @@ from gsopt.data.scene import Scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report
 from gsopt.geometry.cameras import Cameras
-from gsopt.llm_prompts.schema import Prompt, accepted_images, read_prompts, write_prompts
 from gsopt.sds.candidate_views import square_views
 from gsopt.sds.conditioning import Conditioning, encode
 from gsopt.sds.priors.protocol import Images, Prior
+from gsopt.sds.prompts import Prompt, accepted_images, read_prompts, write_prompts
 
 FOLDER, CONDITIONING = "guidance", "conditioning.safetensors"
 EMBEDDED_INPUTS = 8

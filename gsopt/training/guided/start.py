@@ -13,7 +13,7 @@ from gsopt.raster.backend import Backend
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.guidance_step import Guidance, GuidanceSetup
 from gsopt.sds.load_prior import open_prior
-from gsopt.sds.select_prior import choose, fitting
+from gsopt.sds.select_prior import restrict_to_scene, select_prior
 from gsopt.training.guided.guard import Verdict, evaluate_guidance
 from gsopt.training.guided.references import (
     CONDITIONING,
@@ -32,7 +32,7 @@ def require_guidance(config: GuidanceConfig) -> None:
     """Raise InputError for a prompt that cannot be used, UsageError for guidance without a prior: before any work."""
     read_guidance_prompts(config)
     reference_paths(config)
-    choose(config)
+    select_prior(config)
 
 
 def start_guidance(
@@ -45,7 +45,7 @@ def start_guidance(
     """
     recorded = directory.recorded("guidance")
     if recorded is None:
-        choice = fitting(choose(config.guidance), config.guidance, len(scene.train), scene.has_alpha)
+        choice = restrict_to_scene(select_prior(config.guidance), config.guidance, len(scene.train), scene.has_alpha)
         recorded = {"prior": choice.prior, "lambda_sds": choice.weight, "reason": choice.reason}
         if choice.prior is None:
             directory.record(guidance=recorded)

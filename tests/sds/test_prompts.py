@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError
-from gsopt.llm_prompts import schema
-from gsopt.llm_prompts.schema import (
-    LARGEST_FILE,
-    MOST_PROMPTS,
-    Made,
-    Picture,
+from gsopt.sds import prompts as schema
+from gsopt.sds.prompts import (
+    MAX_FILE_BYTES,
+    MAX_PROMPTS,
     Prompt,
     PromptSet,
+    Provenance,
+    ReferenceImage,
     accepted_images,
     prompts_from,
     read_prompts,
@@ -55,8 +55,10 @@ SETS = st.builds(
     domain=st.sampled_from(["", "medicine", "my own"]),
     reviewed=st.booleans(),
     made=st.none()
-    | st.builds(Made, source=st.just("llm:m"), raw=st.just("prompts.raw.json"), warnings=st.just(("w",))),
-    images=st.lists(st.builds(Picture, file=st.just("images/1.png"), prompt=TEXT, accepted=st.booleans())).map(tuple),
+    | st.builds(Provenance, source=st.just("llm:m"), raw=st.just("prompts.raw.json"), warnings=st.just(("w",))),
+    images=st.lists(st.builds(ReferenceImage, file=st.just("images/1.png"), prompt=TEXT, accepted=st.booleans())).map(
+        tuple
+    ),
 )
 
 
@@ -80,7 +82,7 @@ def test_a_whole_file_is_read_as_written_and_follows_the_committed_schema(
 
 
 def test_the_committed_schema_has_the_fields_of_the_records() -> None:
-    records = {"prompt": Prompt, "image": Picture, "made": Made}
+    records = {"prompt": Prompt, "image": ReferenceImage, "made": Provenance}
     for name, kind in records.items():
         assert set(COMMITTED["$defs"][name]["properties"]) == {field.name for field in dataclasses.fields(kind)}
     assert set(COMMITTED["properties"]) == {"version"} | {field.name for field in dataclasses.fields(PromptSet)}
@@ -101,7 +103,7 @@ def test_defaults_in_the_committed_schema_are_those_of_the_records() -> None:
 
 def test_only_accepted_images_are_given_out(tmp_path: Path) -> None:
     path = tmp_path / "prompts.json"
-    write_set(path, PromptSet(images=(Picture("a.png"), Picture("pictures/b.png", accepted=True))))
+    write_set(path, PromptSet(images=(ReferenceImage("a.png"), ReferenceImage("pictures/b.png", accepted=True))))
     assert accepted_images(path) == (tmp_path / "pictures" / "b.png",)
 
 
@@ -192,8 +194,8 @@ def test_a_prompt_that_breaks_the_schema_is_named(prompt: object, named: str) ->
         ('{"version": 1}', "prompts"),
         ('{"version": 2, "prompts": []}', "Version 2"),
         ("[" * 100_000, "prompts.json"),
-        (json.dumps({"version": 1, "prompts": [{"text": "a"}] * (MOST_PROMPTS + 1)}), str(MOST_PROMPTS)),
-        (" " * (LARGEST_FILE + 1), "larger"),
+        (json.dumps({"version": 1, "prompts": [{"text": "a"}] * (MAX_PROMPTS + 1)}), str(MAX_PROMPTS)),
+        (" " * (MAX_FILE_BYTES + 1), "larger"),
     ],
 )
 def test_a_file_that_breaks_the_schema_is_named(tmp_path: Path, content: str, named: str) -> None:

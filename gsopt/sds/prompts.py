@@ -1,4 +1,4 @@
-"""prompts.json: what an expert, a template or a language model says about an object. No torch, no package.
+"""prompts.json: descriptions of an object by an expert, a template or a language model. No torch, no package.
 
     {"version": 1, "notes": "femur, osteoporotic, CT", "object": "femur", "domain": "medicine", "reviewed": false,
      "made": {"source": "template", "template": "medicine", "raw": "", "warnings": []},
@@ -6,9 +6,9 @@
                   "source": "user", "rationale": "", "score": null}],
      "images": [{"file": "prompts-images/01.png", "prompt": "a worn oak chair", "source": "sd21", "accepted": false}]}
 
-`version`, `prompts` and the `text` of each are needed, all else may be left out; prompts.schema.json beside this module
-says the same as JSON Schema. The file is untrusted: bounded in size and number, unknown keys refused by name, no
-control characters in the texts, no path that leaves the file's folder.
+`version`, `prompts` and the `text` of each are required, all else is optional; prompts.schema.json beside this module
+is its JSON Schema. The file is untrusted: bounded in size and number, unknown keys refused by name, no control
+characters in the texts, no path that leaves the file's folder.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
 
 VERSION = 1
-LARGEST_FILE = 1 << 20
-"""Bytes that are read."""
-MOST_PROMPTS = 256
-LONGEST_TEXT = 1000
-"""Characters of a prompt. CLIP reads 77 tokens, about 300 characters."""
-LONGEST_RATIONALE = 4000
-LONGEST_NOTES = 4000
-LONGEST_NAME = 200
-LARGEST_WEIGHT = 1000.0
-MOST_IMAGES = 64
-MOST_WARNINGS = 64
+MAX_FILE_BYTES = 1 << 20
+"""Size limit of the file, bytes."""
+MAX_PROMPTS = 256
+MAX_TEXT_LENGTH = 1000
+"""Length limit of a prompt, characters. CLIP reads 77 tokens, about 300 characters."""
+MAX_RATIONALE_LENGTH = 4000
+MAX_NOTES_LENGTH = 4000
+MAX_NAME_LENGTH = 200
+MAX_WEIGHT = 1000.0
+MAX_IMAGES = 64
+MAX_WARNINGS = 64
 
 View = Literal["all", "front", "side", "back", "top"]
 Polarity = Literal["positive", "negative"]
@@ -47,27 +47,27 @@ FILE = re.compile(r"(\w[\w .-]{0,99}/)?\w[\w .-]{0,99}")
 
 @dataclass(frozen=True)
 class Prompt:
-    """One description, and where it comes from."""
+    """One description and its source."""
 
     text: str
     weight: float = 1.0
-    """Relative to the other prompts of the same polarity; 0 keeps it out."""
+    """Weight relative to the other prompts of the same polarity; 0 disables it."""
     view: View = "all"
-    """From where the object looks like this."""
+    """Side of the object that it describes."""
     polarity: Polarity = "positive"
     source: str = "user"
-    """user, template or llm:MODEL."""
+    """One of user, template or llm:MODEL."""
     rationale: str = ""
-    """Why whoever wrote it wrote it."""
+    """The author's reason."""
     score: float | None = None
-    """CLIP alignment with the input views, None where nobody measured it."""
+    """CLIP alignment with the input views, `None` if not measured."""
 
     def __post_init__(self) -> None:
-        _require_text(self.text, "text", LONGEST_TEXT)
+        _require_text(self.text, "text", MAX_TEXT_LENGTH)
         if not self.text.strip():
             raise InputError("A prompt is empty, got only white space. Say what the object is, or drop the prompt.")
-        _require_text(self.rationale, "rationale", LONGEST_RATIONALE)
-        _require_number(self.weight, "weight", 0.0, LARGEST_WEIGHT)
+        _require_text(self.rationale, "rationale", MAX_RATIONALE_LENGTH)
+        _require_number(self.weight, "weight", 0.0, MAX_WEIGHT)
         if self.score is not None:
             _require_number(self.score, "score", -1.0, 1.0)
         _require_one_of(self.view, "view", get_args(View))
@@ -76,82 +76,82 @@ class Prompt:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReferenceImage:
     """A reference image that a text-to-image model made from a prompt."""
 
     file: str
-    """PNG, relative to the folder of prompts.json, at most one folder below."""
+    """Path of the PNG, relative to the folder of prompts.json, at most one folder below."""
     prompt: str = ""
     source: str = ""
-    """The prior that made it."""
+    """Name of the prior that generated it."""
     accepted: bool = False
-    """Only pictures that the expert accepted guide anything."""
+    """True if the expert accepted it; others are not used for guidance."""
 
     def __post_init__(self) -> None:
         _require_file(self.file, "file")
-        _require_text(self.prompt, "prompt", LONGEST_TEXT)
-        _require_text(self.source, "source", LONGEST_NAME)
+        _require_text(self.prompt, "prompt", MAX_TEXT_LENGTH)
+        _require_text(self.source, "source", MAX_NAME_LENGTH)
         _require_bool(self.accepted, "accepted")
 
 
 @dataclass(frozen=True)
-class Made:
-    """How the prompts came to be."""
+class Provenance:
+    """Origin of a prompt set."""
 
     source: str = "user"
-    """user, template or llm:MODEL: what was asked. Each prompt has its own source."""
+    """Requested source: user, template or llm:MODEL. Each prompt has its own source."""
     template: str = ""
     """Name of the template."""
     raw: str = ""
-    """File with the model's answers as they came, beside prompts.json."""
+    """File with the model's unmodified replies, beside prompts.json."""
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _require_source(self.source)
-        _require_text(self.template, "template", LONGEST_NAME)
+        _require_text(self.template, "template", MAX_NAME_LENGTH)
         if self.raw:
             _require_file(self.raw, "raw")
-        if not isinstance(self.warnings, (tuple, list)) or len(self.warnings) > MOST_WARNINGS:
-            raise InputError(f"`warnings` must be a list of at most {MOST_WARNINGS} texts. Remove some.")
+        if not isinstance(self.warnings, (tuple, list)) or len(self.warnings) > MAX_WARNINGS:
+            raise InputError(f"`warnings` must be a list of at most {MAX_WARNINGS} texts. Remove some.")
         for warning in self.warnings:
-            _require_text(warning, "warnings", LONGEST_RATIONALE)
+            _require_text(warning, "warnings", MAX_RATIONALE_LENGTH)
         object.__setattr__(self, "warnings", tuple(self.warnings))
 
 
 @dataclass(frozen=True)
 class PromptSet:
-    """All of a prompts.json."""
+    """The contents of a prompts.json."""
 
     prompts: tuple[Prompt, ...] = ()
     notes: str = ""
     """The expert's own words."""
     object: str = ""
-    """What the thing is, in a noun or two: every prompt of a model keeps it."""
+    """The object in a noun or two, which every prompt of a model contains."""
     domain: str = ""
     reviewed: bool = False
-    """Whether an expert has looked at every prompt."""
-    made: Made | None = None
-    images: tuple[Picture, ...] = ()
+    """True if an expert has reviewed every prompt."""
+    made: Provenance | None = None
+    images: tuple[ReferenceImage, ...] = ()
 
     def __post_init__(self) -> None:
-        _require_text(self.notes, "notes", LONGEST_NOTES)
-        _require_text(self.object, "object", LONGEST_NAME)
-        _require_text(self.domain, "domain", LONGEST_NAME)
+        _require_text(self.notes, "notes", MAX_NOTES_LENGTH)
+        _require_text(self.object, "object", MAX_NAME_LENGTH)
+        _require_text(self.domain, "domain", MAX_NAME_LENGTH)
         _require_bool(self.reviewed, "reviewed")
 
 
 def read_prompts(path: Path) -> tuple[Prompt, ...]:
-    """The prompts of a file, in its order. Raises InputError that names the file, the prompt and what is wrong."""
+    """Reads the prompts of a file, in its order. Raises InputError that names the file, the prompt and the error."""
     return read_set(path).prompts
 
 
 def read_set(path: Path) -> PromptSet:
-    """The whole file. Raises InputError that names the file, the entry and what is wrong."""
+    """Reads the whole file. Raises InputError that names the file, the entry and the error."""
     try:
         with open(path, "rb") as file:
-            data = file.read(LARGEST_FILE + 1)
-        if len(data) > LARGEST_FILE:
-            raise ValueError(f"larger than {LARGEST_FILE} bytes")
+            data = file.read(MAX_FILE_BYTES + 1)
+        if len(data) > MAX_FILE_BYTES:
+            raise ValueError(f"larger than {MAX_FILE_BYTES} bytes")
         document = json.loads(data)
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"Cannot read the prompts in {path}: {error}. Write them with `gsopt prompts`.") from error
@@ -162,12 +162,12 @@ def read_set(path: Path) -> PromptSet:
 
 
 def prompts_from(document: Any) -> tuple[Prompt, ...]:
-    """The prompts of a parsed prompts.json; InputError when it does not follow the schema."""
+    """Returns the prompts of a parsed prompts.json; raises InputError if it violates the schema."""
     return set_from(document).prompts
 
 
 def set_from(document: Any) -> PromptSet:
-    """A parsed prompts.json; InputError when it does not follow the schema."""
+    """Converts a parsed prompts.json; raises InputError if it violates the schema."""
     if not isinstance(document, dict) or not isinstance(document.get("prompts"), list):
         raise InputError('An object with a list `prompts` is needed. Write {"version": 1, "prompts": [...]}.')
     version = document.get("version")
@@ -175,44 +175,44 @@ def set_from(document: Any) -> PromptSet:
         raise InputError(f"Version {version!r:.80} of prompts is not known, only {VERSION}. Update gsopt.")
     _require_known(document, ("version", *_names(PromptSet)), "The file")
     images = document.get("images", [])
-    if len(document["prompts"]) > MOST_PROMPTS:
-        raise InputError(f"At most {MOST_PROMPTS} prompts are read, got {len(document['prompts'])}. Remove some.")
-    if not isinstance(images, list) or len(images) > MOST_IMAGES:
-        raise InputError(f"`images` must be a list of at most {MOST_IMAGES} pictures. Remove some.")
+    if len(document["prompts"]) > MAX_PROMPTS:
+        raise InputError(f"At most {MAX_PROMPTS} prompts are read, got {len(document['prompts'])}. Remove some.")
+    if not isinstance(images, list) or len(images) > MAX_IMAGES:
+        raise InputError(f"`images` must be a list of at most {MAX_IMAGES} pictures. Remove some.")
     made = document.get("made")
     plain = {name: document[name] for name in ("notes", "object", "domain", "reviewed") if name in document}
     return PromptSet(
         prompts=tuple(_entry(Prompt, values, f"Prompt {i}", "text") for i, values in enumerate(document["prompts"])),
-        images=tuple(_entry(Picture, values, f"Image {i}", "file") for i, values in enumerate(images)),
-        made=None if made is None else _entry(Made, made, "`made`", "source"),
+        images=tuple(_entry(ReferenceImage, values, f"Image {i}", "file") for i, values in enumerate(images)),
+        made=None if made is None else _entry(Provenance, made, "`made`", "source"),
         **plain,
     )
 
 
 def prompts_document(prompts: Iterable[Prompt]) -> dict[str, Any]:
-    """JSON-ready; `prompts_from` is its inverse."""
+    """Returns JSON values; `prompts_from` is the inverse."""
     return {"version": VERSION, "prompts": [asdict(prompt) for prompt in prompts]}
 
 
-def set_document(everything: PromptSet) -> dict[str, Any]:
-    """JSON-ready; `set_from` is its inverse."""
-    values = asdict(everything)
+def set_document(prompt_set: PromptSet) -> dict[str, Any]:
+    """Returns JSON values; `set_from` is the inverse."""
+    values = asdict(prompt_set)
     first = {name: values[name] for name in ("notes", "object", "domain", "reviewed", "made")}
     return {"version": VERSION, **first, "prompts": list(values["prompts"]), "images": list(values["images"])}
 
 
 def write_prompts(path: Path, prompts: Iterable[Prompt]) -> None:
-    """A whole prompts.json or nothing."""
+    """Writes prompts.json atomically."""
     write_atomic(path, to_json(prompts_document(prompts)))
 
 
-def write_set(path: Path, everything: PromptSet) -> None:
-    """A whole prompts.json or nothing."""
-    write_atomic(path, to_json(set_document(everything)))
+def write_set(path: Path, prompt_set: PromptSet) -> None:
+    """Writes prompts.json atomically."""
+    write_atomic(path, to_json(set_document(prompt_set)))
 
 
 def accepted_images(path: Path) -> tuple[Path, ...]:
-    """Paths of the reference images that the expert accepted. InputError for a file that breaks the schema."""
+    """Returns the paths of accepted reference images. Raises InputError for a file that violates the schema."""
     return tuple(path.parent / picture.file for picture in read_set(path).images if picture.accepted)
 
 

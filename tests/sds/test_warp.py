@@ -19,7 +19,7 @@ def camera(x: float) -> Cameras:
 
 
 def plane_depth(seen_from: Cameras) -> torch.Tensor:
-    """z of the plane Z = 0 at every pixel centre."""
+    """z of the plane Z = 0 at every pixel center."""
     rays = lift(seen_from, torch.ones(SIZE, SIZE)) - seen_from.centers[0]
     return -seen_from.centers[0, 2] / rays[..., 2]
 

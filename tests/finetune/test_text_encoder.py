@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,15 +13,14 @@ import torch
 from gsopt.cli import main
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.finetune import captions, evaluation, reconstruction_pairs, run
-from gsopt.finetune.caption_tokens import tell
+from gsopt.finetune.caption_tokens import encode_captions
 from gsopt.finetune.clip import make_tokenizer
-from gsopt.finetune.text_encoder import find_encoder, said_of_all, words_known
+from gsopt.finetune.text_encoder import evaluate_encoder, make_encoder, scene_texts
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.priors.protocol import Condition
-from gsopt.sds.priors.view_conditioned import TOKEN_WIDTH, Said, make_deaf, make_unet, predict
+from gsopt.sds.priors.view_conditioned import TOKEN_WIDTH, TextTokens, make_unet, predict, zero_text_attention
 
 pytest.importorskip("diffusers")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
 from tiny_scenes import write_dataset
 
 SIZE = 64
@@ -31,7 +29,7 @@ CAPTIONS = {"one": "a red cup", "two": "a blue table", "three": "a red table"}
 
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> None:
-    reconstruction_pairs.LENGTHS, evaluation.MOST = (12,), 2
+    reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2
 
 
 @pytest.fixture(scope="module")
@@ -55,16 +53,16 @@ def prior(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pa
     out = tmp_path_factory.mktemp("priors") / "told"
     assert main(command(scenes, out)) == 0
     yield out
-    shutil.rmtree(out)  # 200 MB: the optimiser's state of every weight
+    shutil.rmtree(out)  # 200 MB: the optimizer's state of every weight
 
 
 def test_a_scene_is_described_by_what_lies_beside_it(scenes: Path, tmp_path: Path) -> None:
-    said = captions.said_of(scenes / "one")
+    said = captions.read_captions(scenes / "one")
     assert said[0] == "a red cup"
     assert {"a photo of a red cup", "cup, kitchen", "a red cup, back view", "a red cup, seen from above"} <= set(said)
-    assert captions.said_of(tmp_path) == ()
+    assert captions.read_captions(tmp_path) == ()
     (tmp_path / "captions.json").write_text(json.dumps({"caption": "A\u202e\nCup " + "x" * 999, "views": 3}))
-    hostile = captions.said_of(tmp_path)
+    hostile = captions.read_captions(tmp_path)
     assert all(text.isprintable() and len(text) < 200 for text in hostile)
     assert hostile[0].startswith("a cup")
 
@@ -82,7 +80,7 @@ def test_a_prior_with_captions_takes_words_and_one_without_does_not(prior: Path,
     encoder = open_prior(str(prior), GuidanceConfig()).encoder()
     assert encoder is not None
     assert encoder.unknown_words("a red femur") == ["femur"]
-    assert encoder.texts(["", "a red cup"]).shape == (2, encoder.longest, TOKEN_WIDTH)
+    assert encoder.texts(["", "a red cup"]).shape == (2, encoder.max_tokens, TOKEN_WIDTH)
     assert encoder.alignment(["a red cup"], torch.rand(1, 3, 8, 8)) is None
     judged = open_prior(str(prior), GuidanceConfig(clip=str(prior / "clip"))).encoder()
     assert judged is not None
@@ -110,36 +108,40 @@ def test_what_is_said_reaches_the_network_and_silence_is_silence() -> None:
     tokens = torch.randn(5, TOKEN_WIDTH, generator=torch.Generator().manual_seed(0))
     rows = [Condition(tokens=tokens), Condition(tokens=tokens[:3])]
     with torch.no_grad():
-        both = predict(unet, x, t, planes, Said.by(rows))
-        alone = predict(unet, x[1:], t[1:], planes[1:], Said.by(rows[1:]))
+        both = predict(unet, x, t, planes, TextTokens.from_conditions(rows))
+        alone = predict(unet, x[1:], t[1:], planes[1:], TextTokens.from_conditions(rows[1:]))
         torch.testing.assert_close(both[1:], alone, atol=1e-4, rtol=1e-3)
         silent = predict(unet, x, t, planes)
-        torch.testing.assert_close(silent, predict(unet, x, t, planes, Said.by([Condition(), Condition()])))
+        torch.testing.assert_close(
+            silent, predict(unet, x, t, planes, TextTokens.from_conditions([Condition(), Condition()]))
+        )
         assert float((both - silent).abs().max()) > 1e-3
-        make_deaf(unet)
-        torch.testing.assert_close(predict(unet, x, t, planes, Said.by(rows)), predict(unet, x, t, planes))
+        zero_text_attention(unet)
+        torch.testing.assert_close(
+            predict(unet, x, t, planes, TextTokens.from_conditions(rows)), predict(unet, x, t, planes)
+        )
 
 
 def test_lessons_say_what_belongs_to_their_scene(prior: Path, scenes: Path) -> None:
     """Some rows are told nothing, some the empty text; whoever hears a text hears one of their scene."""
-    library = run.collect([scenes / "one", scenes / "two"], 1, SIZE, 0, prior / "pairs", None, print)  # type: ignore[arg-type]
-    encoder = find_encoder(library, run.Course(), prior / "clip", None, print)
+    cache = run.collect_pairs([scenes / "one", scenes / "two"], 1, SIZE, 0, prior / "pairs", None, print)  # type: ignore[arg-type]
+    encoder = make_encoder(cache, run.PriorTrainingConfig(), prior / "clip", None, print)
     assert encoder is not None
-    told = tell(encoder, library, said_of_all(library))
-    rows = torch.arange(len(library.pairs)).repeat(8)
-    said = told.draw(rows, torch.Generator().manual_seed(0))
+    captions = encode_captions(encoder, cache, scene_texts(cache))
+    rows = torch.arange(len(cache.pairs)).repeat(8)
+    said = captions.sample(rows, torch.Generator().manual_seed(0))
     nothing = said.tokens.flatten(1).abs().sum(1) == 0
-    empty = (said.tokens[:, :-1] == told.tokens[0]).flatten(1).all(1)
+    empty = (said.tokens[:, :-1] == captions.tokens[0]).flatten(1).all(1)
     assert 0.1 < float(nothing.float().mean()) < 0.6
     assert 0.05 < float(empty.float().mean()) < 0.5
     for row in torch.nonzero(~nothing & ~empty)[:, 0].tolist():
-        own = told.texts[int(library.scene[rows[row]])]
-        assert any(torch.equal(said.tokens[row, :-1], told.tokens[i]) for i in own)
-    assert 0 <= words_known(encoder, library)["right_caption"] <= 1
+        own = captions.texts[int(cache.scene[rows[row]])]
+        assert any(torch.equal(said.tokens[row, :-1], captions.tokens[i]) for i in own)
+    assert 0 <= evaluate_encoder(encoder, cache)["right_caption"] <= 1
 
 
 def test_scenes_without_captions_and_scenes_that_cannot_be_fitted_are_left_out(scenes: Path, tmp_path: Path) -> None:
-    """Of five scenes one is silent and one broken: the words are those of the others."""
+    """Five scenes, one without captions and one broken: the words are those of the others."""
     for name in (*CAPTIONS, "silent"):
         write_dataset(tmp_path / "data" / name, train=6, test=2)
         if name in CAPTIONS:

