@@ -16,7 +16,7 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import InitConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.finetune import evaluation, reconstruction_pairs
-from gsopt.finetune.batches import draw
+from gsopt.finetune.batches import draw_batch
 from gsopt.finetune.reconstruction_pairs import Pairs, make_pairs, render_pairs, whole_scene
 from gsopt.finetune.scenes import TrainingScenes
 from gsopt.finetune.trainer import STATE, PriorTrainer, loss
@@ -122,7 +122,7 @@ def test_training_lowers_the_loss(pairs: Pairs) -> None:
     """The loss of a fixed example, before and after twenty steps on its pairs: renders half as bright."""
     pairs = replace(pairs, render=torch.cat([pairs.truth[:, :3] // 2, pairs.truth[:, 3:]], 1))
     trainer = PriorTrainer(make_unet(0), PriorTrainingConfig(steps=20, batch=3, lr=1e-3))
-    example = draw(pairs, 4, trainer.noise, torch.Generator().manual_seed(0))
+    example = draw_batch(pairs, 4, trainer.noise, torch.Generator().manual_seed(0))
     before = float(loss(trainer.unet, example).detach())
     for _ in range(20):
         trainer.advance(pairs)

@@ -13,7 +13,7 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import GsoptError, InputError, UsageError
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.priors.folder import SD21, find_folder
-from gsopt.sds.select_prior import choose
+from gsopt.sds.select_prior import select_prior
 
 
 def truncate(path: Path) -> None:
@@ -141,20 +141,20 @@ def test_what_is_no_name_at_all_is_a_usage_error(name: str) -> None:
 
 
 def test_without_a_prior_at_hand_the_default_is_off_and_says_why() -> None:
-    choice = choose(GuidanceConfig())
+    choice = select_prior(GuidanceConfig())
     assert (choice.prior, choice.weight) == (None, 0.0)
     assert "no prior at hand" in choice.reason
 
 
 def test_zero_is_off_whatever_else_was_given() -> None:
-    choice = choose(GuidanceConfig(lambda_sds=0, prior="sd21", prompt=("a chair",)))
+    choice = select_prior(GuidanceConfig(lambda_sds=0, prior="sd21", prompt=("a chair",)))
     assert (choice.prior, choice.weight) == (None, 0.0)
     assert "lambda_sds is 0" in choice.reason
 
 
 def test_a_named_prior_guides_with_the_default_weight() -> None:
-    assert choose(GuidanceConfig(prior="sd21")).weight == 0.2
-    assert choose(GuidanceConfig(prior="sd21", lambda_sds=0.7)).weight == 0.7
+    assert select_prior(GuidanceConfig(prior="sd21")).weight == 0.2
+    assert select_prior(GuidanceConfig(prior="sd21", lambda_sds=0.7)).weight == 0.7
 
 
 @pytest.mark.parametrize(
@@ -163,4 +163,4 @@ def test_a_named_prior_guides_with_the_default_weight() -> None:
 )
 def test_guidance_that_was_asked_for_is_never_dropped_silently(asked: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="asks for guidance"):
-        choose(GuidanceConfig(**asked))  # type: ignore[arg-type]
+        select_prior(GuidanceConfig(**asked))  # type: ignore[arg-type]
