@@ -186,6 +186,7 @@ LIES = {
     "no count": (set_in("accessors", 0, "count", value=0), "do not fit"),
     "a view past the end": (set_in("bufferViews", 0, "byteLength", value=10**9), "do not fit"),
     "a view far out": (set_in("bufferViews", 0, "byteOffset", value=10**15), "do not fit"),
+    "a last element past its view": (set_in("bufferViews", 0, "byteLength", value=4 * 12 - 1), "claims 4 elements"),
     "no stride": (set_in("bufferViews", 0, "byteStride", value=0), "do not fit"),
     "another file": (set_in("buffers", 0, "uri", value="http://x"), "own binary chunk"),
     "another buffer": (set_in("bufferViews", 0, "buffer", value=1), "own binary chunk"),

@@ -108,22 +108,57 @@ def test_splat_of_what_splat_gave_differs_in_rotations_only(tmp_path: Path) -> N
     assert same_bits(replace(once, quats=twice.quats), twice)
 
 
-@pytest.mark.parametrize("suffix", [".splat", ".spz", ".compressed.ply", ".glb"])
-def test_extremes_stay_usable(tmp_path: Path, suffix: str) -> None:
-    """Values at the end of float32's range are clamped, never turned into something that is not finite."""
+LOSSY = [".splat", ".spz", ".compressed.ply", ".glb"]
+LARGEST_HARMONIC = {".spz": 1.0, ".compressed.ply": 4.0, ".glb": 1e30}
+"""The end of each format's range of bands 1 and up; .splat has none."""
+
+
+def rows_of(splats: Gaussians, suffix: str) -> Gaussians:
+    """The splats in the order in which the format's writer stores them."""
+    return splats.select(morton_order(splats.means.double().flip(-1))) if suffix == ".compressed.ply" else splats
+
+
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_extremes_are_clamped_to_the_end_of_their_side(tmp_path: Path, suffix: str) -> None:
+    """Values at the end of float32's range stay finite and keep their sign: no code wraps around."""
     splats = make_splats(4)
-    splats.log_scales[0], splats.log_scales[1] = -1e30, 1e30
-    splats.logit_opacities[0], splats.logit_opacities[1] = -1e30, 1e30
-    splats.sh0[0], splats.sh0[1] = -1e30, 1e30
-    splats.shN[0], splats.shN[1] = -1e30, 1e30
+    for row, sign in ((0, -1), (1, 1)):
+        splats.log_scales[row] = splats.logit_opacities[row] = splats.sh0[row] = splats.shN[row] = sign * 1e30
     splats.quats[0], splats.quats[1] = torch.tensor([1e-18, 0, 0, 0]), torch.tensor([0, 0, 1e18, 0])
     back = round_trip(tmp_path / f"a{suffix}", splats)
-    order = morton_order(splats.means.double().flip(-1)) if suffix == ".compressed.ply" else torch.arange(4)
-    faint, opaque = order.tolist().index(0), order.tolist().index(1)
-    assert back.opacities[faint] < 0.001
-    assert back.opacities[opaque] > 0.999
-    assert back.log_scales[faint].max() < -9
-    assert back.log_scales[opaque].min() > 5
+    low = rows_of(splats, suffix).logit_opacities.argmin()
+    high = rows_of(splats, suffix).logit_opacities.argmax()
+    assert back.opacities[low] < 0.001
+    assert back.opacities[high] > 0.999
+    assert back.log_scales[low].max() < -9
+    assert back.log_scales[high].min() > 5
+    assert back.sh0[low].max() <= -0.5 / C0 + 1e-5
+    assert back.sh0[high].min() >= 0.5 / C0 - 1e-5
+    if suffix != ".splat":
+        bound = LARGEST_HARMONIC[suffix]
+        assert back.shN[low].max() <= -0.93 * bound
+        assert back.shN[high].min() >= 0.93 * bound
+
+
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_an_extreme_splat_leaves_the_others_as_they_are(tmp_path: Path, suffix: str) -> None:
+    """A dead splat (log-scale -1e6) coarsens its chunk to ±20 at most, and nothing else."""
+    splats = make_splats(4, degree=0)
+    splats.log_scales[0] = -1e6
+    back, ordered = round_trip(tmp_path / f"a{suffix}", splats), rows_of(splats, suffix)
+    others = (ordered.log_scales > -1e6).all(dim=1)
+    step = 40 / 2046 if suffix == ".compressed.ply" else 1 / 32
+    assert int(others.sum()) == 3
+    assert errors(ordered.select(others), back.select(others)).log_scales <= step
+
+
+@pytest.mark.parametrize("value", [0.9, 0.97, 1.0, 1.05, 2.0, 100.0])
+def test_harmonics_beyond_the_range_of_spz_are_clamped(tmp_path: Path, value: float) -> None:
+    splats = make_splats(2)
+    splats.shN[0], splats.shN[1] = value, -value
+    back = round_trip(tmp_path / "a.spz", splats)
+    assert back.shN[0].min() >= min(value, 0.99) - 0.067
+    assert back.shN[1].max() <= 0.067 - min(value, 0.99)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".spz"])
