@@ -7,14 +7,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt._optional import require
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError, UsageError
@@ -25,6 +23,7 @@ from gsopt.geometry import sh
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.quats import from_rotation_matrices
 from gsopt.raster.reference import covariances
+from gsopt.results.viewer_server import start_server
 
 POLL_SECONDS = 0.5
 FRUSTUM_SIZE = 0.05
@@ -78,8 +77,7 @@ class SplatViewer:
     """A viser server with one set of splats and the input cameras. Raises MissingDependency without viser."""
 
     def __init__(self, host: str, port: int) -> None:
-        viser: ModuleType = require("viser", "viewer", "The web viewer")
-        self._server = viser.ViserServer(host=host, port=port, verbose=False)
+        self._server = start_server(host, port)
         self._caption = self._server.gui.add_markdown("waiting for the first splats")
         show = self._server.gui.add_checkbox("input cameras", initial_value=True)
         self._frames = self._server.scene.add_frame("/cameras", show_axes=False)

@@ -116,7 +116,6 @@ class Recorder:
 
     def __init__(self) -> None:
         self.server = MagicMock()
-        self.module = SimpleNamespace(ViserServer=MagicMock(return_value=self.server))
 
     def told(self, what: str) -> list[SimpleNamespace]:
         calls = getattr(self.server.scene, what).call_args_list
@@ -126,7 +125,7 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     fake = Recorder()
-    monkeypatch.setattr(viewer, "require", lambda *_: fake.module)
+    monkeypatch.setattr(viewer, "start_server", lambda *_: fake.server)
     return fake
 
 
