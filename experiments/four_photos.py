@@ -40,7 +40,7 @@ def quarter_medians(gains: dict[str, float]) -> list[str]:
 
 def image(uri: str) -> Image.Image:
     data = base64.b64decode(uri.partition(",")[2])
-    return Image.open(io.BytesIO(data)).convert("RGB").resize((CELL, CELL), Image.Resampling.LANCZOS)
+    return Image.open(io.BytesIO(data), formats=("WEBP",)).convert("RGB").resize((CELL, CELL), Image.Resampling.LANCZOS)
 
 
 def sheet(scenes: list[str], psnr: dict[str, dict[str, float]], pictures: dict) -> Image.Image:

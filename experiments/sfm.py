@@ -90,12 +90,15 @@ def write_video(photos: list[Path], video: Path) -> None:
     import av
     from PIL import Image
 
+    from gsopt.data.image_files import IMAGE_FORMATS
+
     with av.open(str(video), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(FRAMES_A_SECOND), options={"crf": "16"})
-        stream.width, stream.height = Image.open(photos[0]).size
+        stream.width, stream.height = Image.open(photos[0], formats=IMAGE_FORMATS).size
         stream.pix_fmt = "yuv420p"
         for path in photos:
-            container.mux(stream.encode(av.VideoFrame.from_image(Image.open(path).convert("RGB"))))
+            image = Image.open(path, formats=IMAGE_FORMATS).convert("RGB")
+            container.mux(stream.encode(av.VideoFrame.from_image(image)))
         container.mux(stream.encode())
 
 

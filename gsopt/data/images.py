@@ -19,15 +19,12 @@ from PIL import Image
 from torch import Tensor
 
 from gsopt.data import files
+from gsopt.data.image_files import IMAGE_FORMATS, bomb
 from gsopt.data.masks import apply_mask
-from gsopt.data.resample import area_downscale, premultiply, unpremultiply
+from gsopt.data.resample import area_downscale, downscaled, premultiply, unpremultiply
 from gsopt.data.undistort import Undistortion, undistort
 from gsopt.errors import InputError
 
-IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-"""Only these decoders are reachable from a dataset."""
-MAX_PIXELS = 1 << 27
-"""134 megapixels: above any camera, below a decompression bomb."""
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 
 
@@ -93,9 +90,9 @@ class ImageStore:
             pixels = apply_mask(pixels, read_gray(source.mask, source.stored), source.mask)
         if source.undistortion is None and source.stored == (source.width, source.height):
             return pixels
-        planes = premultiply(pixels)
-        if source.undistortion is not None:
-            planes = undistort(planes, self._sample_grid(source.undistortion))
+        if source.undistortion is None:
+            return downscaled(pixels, source.width, source.height)
+        planes = undistort(premultiply(pixels), self._sample_grid(source.undistortion))
         return unpremultiply(area_downscale(planes, source.width, source.height))
 
     def _sample_grid(self, undistortion: Undistortion) -> Float[Tensor, "H W 2"]:
@@ -129,7 +126,7 @@ def read_pixels(path: Path) -> UInt8[Tensor, "H W C"]:
 
 def read_gray(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "H W"]:
     """Decode to one channel of `size`; another size is box-filtered to it when the aspect agrees, else InputError."""
-    with _open(path) as image:
+    with _open(path, channels=1) as image:
         width, height = image.size
         if abs(width * size[1] - height * size[0]) > max(width, height, *size):
             raise InputError(
@@ -143,19 +140,16 @@ def read_gray(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "H W"]:
     return torch.from_numpy(np.array(resized))
 
 
-def _open(path: Path) -> Image.Image:
+def _open(path: Path, channels: int = 4) -> Image.Image:
     if not files.is_regular(path):
         raise InputError(f"The image {path} is not a readable file. Restore it, or remove its frame.")
     try:
         image = Image.open(path, formats=IMAGE_FORMATS)
     except Exception as error:  # decoders raise nearly anything on a hostile file
         raise _undecodable(path, error) from error
-    if image.width * image.height > MAX_PIXELS:
+    if reason := bomb(image, path, channels):
         image.close()
-        raise InputError(
-            f"{path} declares {image.width}x{image.height} pixels, more than the {MAX_PIXELS:,} read at most. "
-            "Downscale it first."
-        )
+        raise InputError(f"{path} declares {reason}. Downscale it first, or save it again.")
     return image
 
 

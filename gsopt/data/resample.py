@@ -8,6 +8,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+ROWS = 256
+"""Rows that are converted to floats at once."""
+
 
 def downscaled_size(extent: int, factor: float) -> int:
     """round(extent / factor), halves up, at least 1: what the published images_2, images_4 folders have."""
@@ -29,6 +32,12 @@ def unpremultiply(planes: Float[Tensor, "C H W"]) -> UInt8[Tensor, "H W C"]:
         color = torch.where(alpha > 0, planes[:3] * 255 / alpha.clamp(min=1e-6), torch.zeros_like(planes[:3]))
         planes = torch.cat([color, alpha])
     return (planes + 0.5).clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous()
+
+
+def downscaled(pixels: UInt8[Tensor, "H W C"], width: int, height: int) -> UInt8[Tensor, "h w C"]:
+    """Area mean of a decoded image. Floats exist for a few rows at a time: a large photo does not fill the memory."""
+    narrow = [_area_along(premultiply(rows), 2, width) for rows in pixels.split(ROWS)]
+    return unpremultiply(_area_along(torch.cat(narrow, dim=1), 1, height))
 
 
 def area_downscale(planes: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C h w"]:

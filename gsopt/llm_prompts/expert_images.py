@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from PIL import Image
 
+from gsopt.data.image_files import IMAGE_FORMATS, bomb
 from gsopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from gsopt.data.scene import View
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 MAX_PIXELS = 64 << 20
 """Size limit of an image, pixels."""
 KEPT_SIDE = 512
@@ -76,9 +76,9 @@ def _read(path: Path) -> Image.Image:
     try:
         if not path.is_file():
             raise OSError("no such file")
-        with Image.open(path, formats=FORMATS) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} px is too large")
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
+            if reason := bomb(image, path, max_pixels=MAX_PIXELS):
+                raise ValueError(f"{reason}: too large")
             return _on_white(image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"Cannot read the image {path}: {error}. Give a PNG, JPEG or WebP file.") from error

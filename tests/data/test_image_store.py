@@ -11,7 +11,8 @@ import torch
 from dataset_builders import SIZE, save_image
 from PIL import Image
 
-from gsopt.data.images import MAX_PIXELS, ImageSource, ImageStore, read_gray, read_header, read_pixels
+from gsopt.data.image_files import MAX_PIXELS
+from gsopt.data.images import ImageSource, ImageStore, read_gray, read_header, read_pixels
 from gsopt.errors import InputError
 
 

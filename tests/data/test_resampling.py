@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.data.resample import area_downscale, downscaled_size, premultiply, unpremultiply
+from gsopt.data.resample import ROWS, area_downscale, downscaled, downscaled_size, premultiply, unpremultiply
 
 sizes = st.integers(1, 40)
 
@@ -22,6 +22,14 @@ def test_each_target_pixel_is_the_mean_of_its_exact_footprint(w: int, h: int, ne
     want = fine.view(2, new_h, h, new_w, w).mean(dim=(2, 4))
     got = area_downscale(planes.float(), new_w, new_h)
     assert torch.allclose(got.double(), want, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("height", [1, ROWS - 1, ROWS, ROWS + 1, 3 * ROWS + 7])
+def test_rows_at_a_time_give_the_bits_of_the_whole_image(height: int, channels: int) -> None:
+    pixels = torch.randint(0, 256, (height, 37, channels), generator=torch.Generator().manual_seed(0)).byte()
+    size = (11, -(-height // 3))
+    assert torch.equal(downscaled(pixels, *size), unpremultiply(area_downscale(premultiply(pixels), *size)))
 
 
 def test_enlarging_is_refused() -> None:

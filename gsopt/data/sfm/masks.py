@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from gsopt.data.image_files import IMAGE_FORMATS
 from gsopt.data.images import read_gray
 from gsopt.data.masks import find_mask
 from gsopt.data.sfm.photos import Photo
@@ -76,7 +77,7 @@ def _from_alpha(photos: list[Photo], target: Path) -> list[str]:
         )
     for photo in photos:
         if photo.has_alpha:
-            with Image.open(photo.path) as image:
+            with Image.open(photo.path, formats=IMAGE_FORMATS) as image:
                 image.convert("RGBA").getchannel("A").save(target / f"{photo.name}.png", compress_level=1)
     return [photo.name for photo in photos if not photo.has_alpha]
 
@@ -88,7 +89,7 @@ def _opaque(photos: list[Photo], target: Path) -> Path:
         if not photo.has_alpha:
             (target / photo.name).symlink_to(photo.path.resolve())
             continue
-        with Image.open(photo.path) as image:
+        with Image.open(photo.path, formats=IMAGE_FORMATS) as image:
             layered = image.convert("RGBA")
             behind = Image.new("RGBA", layered.size, (*OPAQUE_BACKGROUND, 255))
             Image.alpha_composite(behind, layered).convert("RGB").save(target / photo.name, compress_level=1)

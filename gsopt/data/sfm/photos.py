@@ -15,11 +15,13 @@ from jaxtyping import Float32
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from gsopt.data import files
-from gsopt.data.images import MAX_PIXELS
+from gsopt.data.image_files import IMAGE_FORMATS, bomb
 from gsopt.errors import InputError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif")
 HEIC = (".heic", ".heif")
+PHOTO_FORMATS = ("AVIF", "HEIF")
+"""Read besides IMAGE_FORMATS where Pillow, or gsopt[heic], has the decoder."""
 MIN_PHOTO_SIDE = 160
 """Smaller photos hold too few features to be placed, px."""
 COPY_RMS = 1.0
@@ -191,14 +193,19 @@ def _opened(path: Path) -> Image.Image:
         raise InputError("HEIC needs a decoder: pip install 'gsopt[heic]', or export the photo as JPEG")
     if path.stat().st_size == 0:
         raise InputError("is empty (0 bytes). Copy it again from the camera")
+    Image.init()
+    formats = (*IMAGE_FORMATS, *(name for name in PHOTO_FORMATS if name in Image.OPEN))
     try:
-        image = Image.open(path)
+        image = Image.open(path, formats=formats)
     except UnidentifiedImageError as error:
-        raise InputError("is no image, whatever its name says. Copy it again from the camera") from error
+        raise InputError(
+            f"is no image, whatever its name says; read are {', '.join(formats)}. Copy it again from the camera"
+        ) from error
     except Exception as error:
         raise InputError(f"cannot be decoded ({_short(error)}). Copy it again from the camera") from error
-    if image.width * image.height > MAX_PIXELS:
-        raise InputError(f"too large: {image.width}x{image.height} px. Scale it down to {MAX_PIXELS:,} pixels")
+    if reason := bomb(image, path):
+        image.close()
+        raise InputError(f"too large: {reason}. Scale it down, or save it again")
     return image
 
 

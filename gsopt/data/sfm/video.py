@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from PIL import Image
 
 from gsopt._optional import require
-from gsopt.data.images import MAX_PIXELS
+from gsopt.data.image_files import MAX_PIXELS
 from gsopt.data.sfm.photos import sharpness
 from gsopt.errors import InputError
 

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gsopt.config.train import DataConfig
 from gsopt.data.files import is_regular
-from gsopt.data.images import IMAGE_FORMATS, read_header, read_pixels
+from gsopt.data.image_files import IMAGE_FORMATS
+from gsopt.data.images import read_header, read_pixels
 from gsopt.data.scene import View, is_posed, load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import is_regular
+from gsopt.data.image_files import IMAGE_FORMATS, bomb
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report
@@ -77,9 +78,9 @@ def _read_reference(path: Path, size: int) -> Tensor:
     try:
         if not is_regular(path):
             raise OSError("no such file")
-        with Image.open(path, formats=("PNG", "JPEG", "WEBP", "BMP", "TIFF")) as image:
-            if image.width * image.height > MAX_REFERENCE_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} px is too large")
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
+            if reason := bomb(image, path, max_pixels=MAX_REFERENCE_PIXELS):
+                raise ValueError(f"{reason}: too large")
             rgba = image.convert("RGBA")
         white = Image.new("RGBA", rgba.size, "white")
         picture = Image.alpha_composite(white, rgba).convert("RGB")
