@@ -76,7 +76,7 @@ BLENDERS ?= 4.2.23 4.5.15 5.0.1 5.2.3
 test-blender: $(BLENDERS:%=test-blender-%)
 
 test-blender-%: build/blender-%/.ready $(VENV)/.for-test
-	OMP_NUM_THREADS=1 GSOPT_BLENDERS=$(CURDIR)/build/blender-$*/bin/python \
+	OMP_NUM_THREADS=1 GSOPT_PYTHON=$(CURDIR)/$(PY) GSOPT_BLENDERS=$(CURDIR)/build/blender-$*/bin/python \
 	  build/blender-$*/bin/python -m pytest -p no:cacheprovider tests/scripts/synth tests/blender
 
 .PRECIOUS: build/blender-%/.ready
@@ -90,7 +90,7 @@ build/blender-%/.ready:
 BLENDER ?= blender
 test-blender-gui: $(VENV)/.for-demo
 	rm -rf build/blender-window
-	LIBGL_ALWAYS_SOFTWARE=1 OMP_NUM_THREADS=1 xvfb-run -a -s "-screen 0 1300x1250x24" $(BLENDER) --factory-startup \
+	GSOPT_PYTHON=$(CURDIR)/$(PY) LIBGL_ALWAYS_SOFTWARE=1 OMP_NUM_THREADS=1 xvfb-run -a -s "-screen 0 1300x1250x24" $(BLENDER) --factory-startup \
 	  --gpu-backend opengl --window-geometry 0 0 1300 1250 --python tests/blender/gui.py -- build/blender-window gsopt/demo
 	@cat build/blender-window/found.json; grep -q '"ok": true' build/blender-window/found.json
 

@@ -38,6 +38,7 @@ class GSOPT_PT_main(Sidebar, bpy.types.Panel):
         if settings.message:
             tell(layout.box(), settings.message, "ERROR")
         values(layout, settings, "folder")
+        layout.operator("gsopt.allow_interpreter", icon="LOCKED")
         layout.operator("gsopt.test", text="Test Interpreter", icon="CHECKMARK")
         if settings.doctor:
             tell(layout.box(), settings.doctor, "INFO")

@@ -9,11 +9,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import CollectionProperty, StringProperty
 
 from .core import interpreter
+from .properties import GsoptPath
 
-DEFAULTS = SimpleNamespace(interpreter="", checkout="", folder="", llm="", model="")
+DEFAULTS = SimpleNamespace(interpreter="", checkout="", folder="", llm="", model="", allowed=())
 
 
 class GsoptPreferences(bpy.types.AddonPreferences):
@@ -23,9 +24,11 @@ class GsoptPreferences(bpy.types.AddonPreferences):
 
     interpreter: StringProperty(  # type: ignore[valid-type]
         name="Interpreter",
-        description="Python in which gsopt is installed; empty: found near the file, the project and on PATH",
+        description="Python in which gsopt is installed; empty: one that you allow, beside the file or on PATH",
         subtype="FILE_PATH",
     )
+    allowed: CollectionProperty(type=GsoptPath)  # type: ignore[valid-type]
+    """Interpreters that were found and that the user has allowed to run, by their real paths."""
     checkout: StringProperty(  # type: ignore[valid-type]
         name="Source Folder",
         description="Folder of gsopt's sources with scripts/synth_views.py; empty: found above the interpreter",
@@ -47,7 +50,12 @@ class GsoptPreferences(bpy.types.AddonPreferences):
         layout.use_property_split = True
         for name in ("interpreter", "checkout", "folder", "llm", "model"):
             layout.prop(self, name)
-        layout.operator("gsopt.test", icon="CHECKMARK")
+        for entry in self.allowed:
+            layout.label(text=f"Allowed: {entry.path}", icon="CHECKMARK")
+        row = layout.row(align=True)
+        row.operator("gsopt.test", icon="CHECKMARK")
+        row.operator("gsopt.allow_interpreter", icon="LOCKED")
+        row.operator("gsopt.forget_interpreters", icon="X")
         for line in textwrap.wrap(context.scene.gsopt.doctor, 90):
             layout.label(text=line)
 
@@ -71,12 +79,19 @@ def work_folder(context: Any) -> Path:
     return absolute("//gsopt") if bpy.data.filepath else Path.home() / "gsopt"
 
 
+def project_folder() -> Path | None:
+    """The folder of the open file."""
+    return Path(bpy.data.filepath).parent if bpy.data.filepath else None
+
+
+def allowed(context: Any) -> set[str]:
+    """Interpreters that were found and may run."""
+    return {entry.path for entry in preferences(context).allowed}
+
+
 def python(context: Any) -> Path:
-    """The interpreter with gsopt. UsageError, with what to do, where there is none."""
-    near = [Path(__file__).resolve().parent, Path.cwd()]
-    if bpy.data.filepath:
-        near.insert(0, Path(bpy.data.filepath).parent)
-    return interpreter.find(preferences(context).interpreter, near, os.environ)
+    """The interpreter with gsopt. UsageError, with what to do, where there is none that may run."""
+    return interpreter.find(preferences(context).interpreter, allowed(context), project_folder(), os.environ)
 
 
 def script(context: Any) -> Path:

@@ -11,6 +11,7 @@ from . import (
     operators_cameras,
     operators_guidance,
     operators_inspect,
+    operators_interpreter,
     operators_run,
     operators_source,
     panel,
@@ -20,8 +21,9 @@ from . import (
 )
 
 CLASSES = (
-    preferences.GsoptPreferences,
     *properties.CLASSES,
+    preferences.GsoptPreferences,
+    *operators_interpreter.CLASSES,
     *operators_source.CLASSES,
     *operators_guidance.CLASSES,
     *operators_run.CLASSES,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +33,17 @@ def odd_folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def panel(tmp_path: Path) -> Iterator[Any]:
+def gsopt_python(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """GSOPT_PYTHON names a Python that runs this checkout's gsopt, unless it names one already."""
+    program = tmp_path_factory.mktemp("python") / "gsopt-python"
+    words = shlex.join([f"PYTHONPATH={ROOT}", sys.executable])
+    program.write_text(f'#!/bin/sh\nexec env {words} "$@"\n', encoding="utf-8")
+    program.chmod(0o755)
+    monkeypatch.setenv("GSOPT_PYTHON", os.environ.get("GSOPT_PYTHON", str(program)))
+
+
+@pytest.fixture
+def panel(tmp_path: Path, gsopt_python: None) -> Iterator[Any]:
     """An empty scene with the extension enabled; its settings."""
     bpy = pytest.importorskip("bpy", reason="Blender's module is not installed (pip install bpy)")
     import blender_addon

@@ -1,4 +1,4 @@
-"""Programs that the panel starts: found, begun with a clean environment, watched, ended, and heard when they fail."""
+"""Programs that the panel starts: begun with a clean environment, watched, ended, and what they report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from blender_addon.core import interpreter, job
+from blender_addon.core import job
 from blender_addon.core.errors import InputError, UsageError
 
 
@@ -78,67 +78,6 @@ def test_a_damaged_record_is_refused(tmp_path: Path, record: str) -> None:
     (tmp_path / job.RECORD).write_text(record)
     with pytest.raises(InputError, match=r"job\.json"):
         job.read_job(tmp_path)
-
-
-def make_venv(folder: Path) -> Path:
-    python = interpreter.python_of(folder / ".venv")
-    python.parent.mkdir(parents=True)
-    for path in (python, python.with_name(interpreter.console_script())):
-        path.touch(mode=0o755)
-    return python
-
-
-def test_the_interpreter_is_found_above_the_file_and_checked_when_named(tmp_path: Path) -> None:
-    python = make_venv(tmp_path / "project")
-    below = tmp_path / "project" / "scenes" / "a"
-    below.mkdir(parents=True)
-    assert interpreter.find("", [below], {}) == python
-    assert interpreter.find(str(python), [], {}) == python
-    other = make_venv(tmp_path / "other")
-    assert interpreter.find("", [below], {"GSOPT_PYTHON": str(other)}) == other
-    with pytest.raises(UsageError, match="not there"):
-        interpreter.find(str(tmp_path / "gone"), [below], {})
-    with pytest.raises(UsageError, match="Install gsopt"):
-        interpreter.find("", [tmp_path / "elsewhere"], {"PATH": ""})
-
-
-def test_the_source_folder_is_found_above_the_interpreter(tmp_path: Path) -> None:
-    python = make_venv(tmp_path)
-    with pytest.raises(UsageError, match=r"synth_views\.py"):
-        interpreter.checkout(python)
-    (tmp_path / "scripts").mkdir()
-    (tmp_path / "scripts" / "synth_views.py").touch()
-    assert interpreter.checkout(python) == tmp_path
-    with pytest.raises(UsageError, match=r"synth_views\.py"):
-        interpreter.checkout(python, str(tmp_path / "nowhere"))
-
-
-ANSWER = {
-    "gsopt": "0.1.0",
-    "rasterizer": {"backend": "cpu", "isa": "avx2", "ms_per_step": 9.5, "problem": None},
-    "missing_extras": {"sds": "pip", "": "pip"},
-}
-
-
-def test_the_doctors_answer_is_read() -> None:
-    answer = interpreter.read_answer("a warning\n" + json.dumps(ANSWER), "python")
-    assert answer.line == "gsopt 0.1.0: avx2, 9.5 ms a step; not installed: sds"
-
-
-@pytest.mark.parametrize(
-    ("output", "said"),
-    [
-        ("/usr/bin/python3: No module named gsopt", "no working gsopt: /usr/bin/python3: No module named gsopt"),
-        ("", "said nothing"),
-        ('{"gsopt": "0.1.0"}', "no working gsopt"),
-        (json.dumps({**ANSWER, "gsopt": "7.3.1"}), "gsopt 7.3.1, this extension knows 0.1"),
-        (json.dumps({**ANSWER, "rasterizer": None}), "no working gsopt"),
-    ],
-)
-def test_a_wrong_interpreter_is_told_apart(output: str, said: str) -> None:
-    with pytest.raises(InputError) as caught:
-        interpreter.read_answer(output, "python")
-    assert said in str(caught.value)
 
 
 def test_a_job_outlives_a_killed_blender_and_is_found_again(tmp_path: Path) -> None:
