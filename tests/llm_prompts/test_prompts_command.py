@@ -189,14 +189,14 @@ def test_a_clip_that_cannot_be_opened_stops_before_the_model_is_asked(tmp_path: 
 
 
 def test_a_dataset_gives_its_input_views(tmp_path: Path) -> None:
-    from gsopt.llm_prompts.expert_images import MOST_SENT, SIDE, read_views, to_jpegs, to_squares
+    from gsopt.llm_prompts.expert_images import KEPT_SIDE, MAX_SENT_IMAGES, read_views, to_jpegs, to_squares
 
     scene = write_dataset(tmp_path / "cloud", train=20)
     views = read_views([scene])
     assert 4 <= len(views) <= 8
-    assert all(max(view.size) <= SIDE and view.mode == "RGB" for view in views)
+    assert all(max(view.size) <= KEPT_SIDE and view.mode == "RGB" for view in views)
     assert views[0].getpixel((0, 0)) == (255, 255, 255)  # transparent pixels are white
-    assert 1 <= len(to_jpegs(views)) <= MOST_SENT
+    assert 1 <= len(to_jpegs(views)) <= MAX_SENT_IMAGES
     assert to_squares(views, 16).shape == (len(views), 3, 16, 16)
     assert to_squares(views, 16)[0, :, 0, 0].tolist() == [1, 1, 1]
 
