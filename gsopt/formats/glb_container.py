@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -32,6 +32,8 @@ class Document:
     """First byte of the binary chunk in the file."""
     length: int
     path: Path
+    _lists: dict[str, list[Mapping[str, Any]]] = field(default_factory=dict)
+    """The root's lists of objects, each checked once."""
 
     def fail(self, what: str) -> NoReturn:
         """Raise InputError: `what` is wrong with this file."""
@@ -58,7 +60,9 @@ class Document:
 
     def item(self, key: str, index: int) -> Mapping[str, Any]:
         """Object number `index` of a list of the root."""
-        items = self.objects(self.root, key)
+        items = self._lists.get(key)
+        if items is None:
+            items = self._lists[key] = self.objects(self.root, key)
         if index >= len(items):
             self.fail(f"`{key}` must have an item {index}, got {len(items)} items")
         return items[index]

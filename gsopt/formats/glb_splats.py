@@ -57,11 +57,13 @@ def splat_primitives(document: Document) -> list[dict[str, Accessor]]:
     if unknown:
         document.fail(f"needs extensions that gsopt does not know: {', '.join(unknown)[:80]}")
     found = []
+    placements = _placements(document)
     for mesh, description in enumerate(document.objects(document.root, "meshes")):
         for primitive in document.objects(description, "primitives"):
             if EXTENSION in document.object(primitive, "extensions"):
                 _check_extension(document, document.object(document.object(primitive, "extensions"), EXTENSION))
-                _check_placement(document, mesh)
+                if mesh in placements:
+                    document.fail(f"{placements[mesh]}, which is not applied. Apply it where the file was exported")
                 attributes = document.object(primitive, "attributes")
                 found.append({name: _accessor(document, attributes, name) for name in attributes if _wanted(name)})
     if not found:
@@ -85,23 +87,23 @@ def _check_extension(document: Document, extension: Mapping[str, Any]) -> None:
         document.fail(f"its splats are compressed ({', '.join(extension['extensions'])[:80]})")
 
 
-def _check_placement(document: Document, mesh: int) -> None:
-    """InputError if a node moves, rotates or scales this mesh: the spherical harmonics would need the same rotation."""
+def _placements(document: Document) -> dict[int, str]:
+    """The meshes that a node moves, rotates or scales, with a description of that node: their harmonics would need
+    the same rotation. Visits each node once."""
     nodes = document.objects(document.root, "nodes")
-    pending = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
-    parents: dict[int, list[int]] = {}
+    placed: dict[int, str] = {}
+    visited: set[int] = set()
     for i, node in enumerate(nodes):
-        for child in node.get("children", []) if isinstance(node.get("children", []), list) else []:
-            parents.setdefault(child, []).append(i) if isinstance(child, int) else None
-    seen: set[int] = set()
-    while pending:
-        i = pending.pop()
-        if i not in seen:
-            seen.add(i)
-            pending += parents.get(i, [])
-            moved = [key for key, value in _IDENTITY.items() if nodes[i].get(key, value) != value]
-            if moved:
-                document.fail(f"node {i} has a {moved[0]}, which is not applied. Apply it where the file was exported")
+        moved = [key for key, value in _IDENTITY.items() if node.get(key, value) != value]
+        pending = [i] if moved else []
+        while pending:
+            inner = pending.pop()
+            if inner not in visited and 0 <= inner < len(nodes):
+                visited.add(inner)
+                mesh, children = nodes[inner].get("mesh"), nodes[inner].get("children")
+                placed |= {mesh: f"node {i} has a {moved[0]}"} if isinstance(mesh, int | float) else {}
+                pending += [child for child in children if isinstance(child, int)] if isinstance(children, list) else []
+    return placed
 
 
 def _accessor(document: Document, attributes: Mapping[str, Any], name: str) -> Accessor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -219,6 +220,48 @@ def test_values_out_of_range_are_refused(tmp_path: Path, name: str, value: float
     write(tmp_path / "b.glb", document, binary[:offset] + struct.pack("<f", value) + binary[offset + 4 :])
     with pytest.raises(InputError, match=message):
         load_splats(tmp_path / "b.glb")
+
+
+def many_accessors(document: dict[str, Any], count: int) -> None:
+    """`count` primitives, and as many accessors, that hold one splat each."""
+    document["accessors"] = [{**accessor, "count": 1} for accessor in document["accessors"]]
+    document["accessors"] += [{"bufferView": 0, "componentType": FLOAT, "count": 1, "type": "VEC3"}] * count
+    document["meshes"][0]["primitives"] *= count
+
+
+def many_nodes(document: dict[str, Any], count: int) -> None:
+    """A chain of `count` nodes and as many meshes."""
+    document["nodes"] = [{"mesh": i, "children": [i + 1]} for i in range(count)] + [{}]
+    document["accessors"] = [{**accessor, "count": 1} for accessor in document["accessors"]]
+    document["meshes"] *= count
+
+
+def calls_to_load(path: Path) -> int:
+    """Number of function calls and returns, of Python and of C, while a file is read."""
+    events = 0
+
+    def count(*_: object) -> None:
+        nonlocal events
+        events += 1
+
+    sys.setprofile(count)
+    load_splats(path)
+    sys.setprofile(None)
+    return events
+
+
+@pytest.mark.parametrize("change", [many_accessors, many_nodes])
+def test_the_work_is_linear_in_the_number_of_primitives_and_nodes(
+    tmp_path: Path, change: Callable[[dict[str, Any], int], None]
+) -> None:
+    save_splats(tmp_path / "a.glb", make_splats(400, degree=0))
+    calls = []
+    for count in (200, 400):
+        document, binary = parse(tmp_path / "a.glb")
+        change(document, count)
+        write(tmp_path / "b.glb", document, binary)
+        calls.append(calls_to_load(tmp_path / "b.glb"))
+    assert calls[1] < 2.2 * calls[0]
 
 
 @pytest.mark.parametrize("text", [b"[" * 100_000, b'{"a":', b"[]   ", b"\xff\xfe  ", b"1" * 5000])
