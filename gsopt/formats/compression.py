@@ -13,17 +13,17 @@ from gsopt.formats.files import read_exactly
 
 _PIECE = 1 << 16
 _GZIP_WINDOW = 16 + zlib.MAX_WBITS
-_ALWAYS_ALLOWED = 1 << 26
-"""Bytes that any file may unpack to (64 MiB)."""
-_MAX_RATIO = 50
-"""Beyond 64 MiB, a file may unpack to this many times its size; real splats reach about 5."""
+_ALWAYS_ALLOWED = 1 << 23
+"""Bytes that any file may decode to (8 MiB, 150,000 splats without view-dependent color)."""
+_MAX_RATIO = 100
+"""Beyond 8 MiB, a file may decode to this many times its size; real splats reach about 20."""
 
 
-def check_ratio(unpacked: int, packed: int, path: Path) -> None:
-    """InputError when `unpacked` bytes out of a file of `packed` bytes are implausible."""
-    if unpacked > max(_ALWAYS_ALLOWED, _MAX_RATIO * packed):
+def check_budget(decoded: int, packed: int, path: Path) -> None:
+    """InputError when `decoded` bytes of float32 parameters out of a file of `packed` bytes are implausible."""
+    if decoded > max(_ALWAYS_ALLOWED, _MAX_RATIO * packed):
         raise InputError(
-            f"{path} claims to unpack from {packed} to {unpacked} bytes, {_MAX_RATIO} times its size is the limit. "
+            f"{path} claims to decode from {packed} to {decoded} bytes, {_MAX_RATIO} times its size is the limit. "
             "It is damaged or hostile: export it again."
         )
 
@@ -81,7 +81,6 @@ def unzstd(file: BinaryIO, sizes: tuple[int, int], count: int, file_size: int, p
     packed, plain = sizes
     if plain != count or packed > file_size:
         raise InputError(f"{path} claims a stream of {packed} to {plain} bytes, {count} needed. Export it again.")
-    check_ratio(plain, file_size, path)
     zstandard = require("zstandard", "spz", "Reading .spz version 4")
     data = read_exactly(file, packed, path, "a stream")
     try:

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from gsopt.errors import InputError
 from gsopt.formats.axes import RIGHT_UP_BACK, with_flipped_axes
-from gsopt.formats.compression import GzipStream, check_ratio, deflated, unzstd, zstandard_compressed
+from gsopt.formats.compression import GzipStream, check_budget, deflated, unzstd, zstandard_compressed
 from gsopt.formats.files import opened, read_exactly, replacing
 from gsopt.formats.spz_codes import pack, stream_sizes, unpack
 from gsopt.formats.validation import MAX_SH_DEGREE, checked, storable
@@ -45,6 +45,11 @@ class _Header:
     def sizes(self) -> tuple[int, ...]:
         """Bytes of each attribute, in file order."""
         return stream_sizes(self.count, self.sh_degree, self.version)
+
+    @property
+    def decoded(self) -> int:
+        """Bytes of the float32 parameters."""
+        return 4 * self.count * (11 + 3 * (self.sh_degree + 1) ** 2)
 
 
 def save_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False, version: int = 3) -> None:
@@ -76,7 +81,7 @@ def save_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False, ver
 def load_spz(path: Path) -> Gaussians:
     """Read a .spz of version 2, 3 or (with the package `zstandard`) 4, SH degree 0 to 3.
 
-    Extensions are refused because they change the meaning of the values. A file that would unpack to far more than its
+    Extensions are refused because they change the meaning of the values. A file that would decode to far more than its
     own size is refused before it is unpacked.
     """
     with opened(path) as (file, size):
@@ -108,7 +113,7 @@ def _is_gzip(file: BinaryIO, path: Path) -> bool:
 def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes]]:
     stream = GzipStream(file, path)
     header = _parse(stream.take(_HEADER.size), path, (2, 3))
-    check_ratio(sum(header.sizes), size, path)
+    check_budget(header.decoded, size, path)
     streams = [stream.take(count) for count in header.sizes]
     stream.finish()
     return header, streams
@@ -117,7 +122,7 @@ def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[byt
 def _read_zstandard(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes]]:
     header = _parse(read_exactly(file, _HEADER.size, path, "its header"), path, (4,))
     (table,) = _TABLE_OFFSET.unpack(read_exactly(file, _TABLE_OFFSET.size, path, "its header"))
-    check_ratio(sum(header.sizes), size, path)
+    check_budget(header.decoded, size, path)
     expected = [count for count in header.sizes if count]
     if header.streams != len(expected) or table != _HEADER.size + _TABLE_OFFSET.size:
         want = f"{len(expected)} streams and a table at byte {_HEADER.size + _TABLE_OFFSET.size}"

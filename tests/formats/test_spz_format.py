@@ -15,6 +15,7 @@ from splat_samples import errors, make_splats, same_bits
 from gsopt.errors import InputError, MissingDependency
 from gsopt.formats import load_splats, save_splats
 from gsopt.formats.spz import save_spz
+from gsopt.formats.spz_codes import stream_sizes
 
 HEADER = struct.Struct("<4sIIBBBB")
 
@@ -126,6 +127,27 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="times its size"):
         load_splats(tmp_path / "a.spz")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # kB
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_a_small_file_decodes_to_little(tmp_path: Path, version: int, degree: int) -> None:
+    """Equal splats pack to a thousandth: the parameters of a small file are bounded by 8 MiB, not by its claim."""
+    zstandard = pytest.importorskip("zstandard")
+    for count, allowed in ((8000, True), (400_000, False)):
+        sizes = [size for size in stream_sizes(count, degree, version) if size]
+        header = HEADER.pack(b"NGSP", version, count, degree, 12, 0, len(sizes) if version == 4 else 0)
+        data = gzip.compress(header + bytes(sum(sizes)), 9)
+        if version == 4:
+            streams = [zstandard.compress(bytes(size)) for size in sizes]
+            table = b"".join(struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True))
+            data = header + struct.pack("<I12x", 32) + table + b"".join(streams)
+        (tmp_path / "a.spz").write_bytes(data)
+        if allowed:
+            assert len(load_splats(tmp_path / "a.spz")) == count
+        else:
+            with pytest.raises(InputError, match="claims to decode from"):
+                load_splats(tmp_path / "a.spz")
 
 
 def test_a_zstandard_bomb_is_not_unpacked(tmp_path: Path) -> None:
