@@ -10,7 +10,7 @@ import typing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from gsopt.errors import InputError, SettingError, UsageError
+from gsopt.errors import InputError, SettingError, UsageError, shortened
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,7 +38,9 @@ def fields(settings: Any, section: str = "") -> None:
         if requirement := _broken(hints[field.name], value):
             name = f"{section}.{field.name}" if section else field.name
             default = "" if field.default is None else f" of {field.default}"
-            raise SettingError(f"`{name}` must {requirement}, got {value!r}. Leave it out for the default{default}.")
+            raise SettingError(
+                f"`{name}` must {requirement}, got {shortened(value)}. Leave it out for the default{default}."
+            )
 
 
 @functools.cache
@@ -75,7 +77,7 @@ def within(name: str, value: float, low: float, high: float, remedy: str) -> Non
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise UsageError unless `value` is one of `allowed`."""
     if value not in allowed:
-        raise UsageError(f"`{name}` must be one of {', '.join(allowed)}; got {value!r}. Pick one of these.")
+        raise UsageError(f"`{name}` must be one of {', '.join(allowed)}; got {shortened(value)}. Pick one of these.")
 
 
 def finite(name: str, tensor: Tensor, largest: float = math.inf) -> None:

@@ -5,11 +5,22 @@ Every message states what was wrong, what was given, and what to do about it.
 
 from __future__ import annotations
 
+import reprlib
+
+MAX_MESSAGE = 2000
+"""Characters of a message; its middle is left out beyond."""
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 80, 80
+
 
 class GsoptError(Exception):
     """Base of every error a caller can cause. `exit_code` is what `gsopt` exits with."""
 
     exit_code = 1
+
+    def __init__(self, message: str = "") -> None:
+        half = MAX_MESSAGE // 2
+        super().__init__(message if len(message) <= MAX_MESSAGE else f"{message[:half]} [...] {message[-half:]}")
 
 
 class UsageError(GsoptError):
@@ -38,3 +49,8 @@ class MissingDependency(GsoptError):
     """An optional package is not installed; the message carries the pip line that installs it (exit code 2)."""
 
     exit_code = 2
+
+
+def shortened(value: object) -> str:
+    """A value of a file as messages repeat it: at most 80 characters, however long or deeply nested it is."""
+    return _SHORT.repr(value)[:80]

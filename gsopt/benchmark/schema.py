@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 
 Schema = Any
 SPREAD = {"median": float, "iqr": float}
@@ -122,5 +122,5 @@ def _name(kind: Any) -> str:
 
 def _mismatch(where: str, want: str, got: Any) -> InputError:
     return InputError(
-        f"`{where}` must be {want}, got {str(got)[:80]!r}. Correct the file, or write it again with `gsopt bench`."
+        f"`{where}` must be {want}, got {shortened(got)}. Correct the file, or write it again with `gsopt bench`."
     )

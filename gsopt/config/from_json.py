@@ -7,7 +7,7 @@ import types
 import typing
 from typing import Any, Literal, TypeVar
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 
 T = TypeVar("T")
 
@@ -32,7 +32,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if _matches(hint, value):
         return tuple(value) if isinstance(value, list) else value
     name = getattr(hint, "__name__", str(hint))
-    raise InputError(f"`{where}` must be {name}, got {value!r}. Correct it or remove the key for the default.")
+    raise InputError(f"`{where}` must be {name}, got {shortened(value)}. Correct it or remove the key for the default.")
 
 
 def _matches(hint: Any, value: Any) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 
 MAX_LINE = 64 << 20
 """Characters; a COLMAP keypoint line with a million points is 30 MB."""
@@ -66,8 +66,7 @@ def number(value: Any, where: str) -> float:
         if not math.isfinite(result):
             raise ValueError
     except (ValueError, OverflowError) as error:
-        got = repr(value)[:60]
-        raise InputError(f"{where} must be a finite number, got {got}. Correct the file.") from error
+        raise InputError(f"{where} must be a finite number, got {shortened(value)}. Correct the file.") from error
     return result
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 from gsopt.formats.files import read_exactly
 
 MAGIC = b"glTF"
@@ -42,20 +42,20 @@ class Document:
     def object(self, owner: Mapping[str, Any], key: str) -> Mapping[str, Any]:
         """The object at `key`, empty when absent."""
         value = owner.get(key, {})
-        return value if isinstance(value, dict) else self.fail(f"`{key}` must be an object, got {str(value)[:40]}")
+        return value if isinstance(value, dict) else self.fail(f"`{key}` must be an object, got {shortened(value)}")
 
     def objects(self, owner: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
         """The list of objects at `key`, empty when absent."""
         value = owner.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-            self.fail(f"`{key}` must be a list of objects, got {str(value)[:40]}")
+            self.fail(f"`{key}` must be a list of objects, got {shortened(value)}")
         return value
 
     def integer(self, owner: Mapping[str, Any], key: str, default: int | None = None) -> int:
         """The integer >= 0 at `key`; when absent `default`, or InputError where that is None."""
         value = owner.get(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-            self.fail(f"`{key}` must be an integer >= 0, got {str(value)[:40]}")
+            self.fail(f"`{key}` must be an integer >= 0, got {shortened(value)}")
         return value
 
     def item(self, key: str, index: int) -> Mapping[str, Any]:
@@ -71,7 +71,7 @@ class Document:
         """The list of strings at `key` of the root."""
         value = self.root.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            self.fail(f"`{key}` must be a list of names, got {str(value)[:40]}")
+            self.fail(f"`{key}` must be a list of names, got {shortened(value)}")
         return value
 
 

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from gsopt.errors import shortened
 from gsopt.formats.files import read_exactly
 from gsopt.formats.glb_container import Document
 
@@ -82,16 +83,16 @@ def _check_extension(document: Document, extension: Mapping[str, Any]) -> None:
     known = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     for key, value in known.items():
         if extension.get(key, value) != value:
-            document.fail(f"`{key}` must be {value}, got {str(extension[key])[:40]}")
+            document.fail(f"`{key}` must be {value}, got {shortened(extension[key])}")
     if document.object(extension, "extensions"):
         document.fail(f"its splats are compressed ({', '.join(extension['extensions'])[:80]})")
 
 
-def _placements(document: Document) -> dict[int, str]:
+def _placements(document: Document) -> dict[float, str]:
     """The meshes that a node moves, rotates or scales, with a description of that node: their harmonics would need
     the same rotation. Visits each node once."""
     nodes = document.objects(document.root, "nodes")
-    placed: dict[int, str] = {}
+    placed: dict[float, str] = {}
     visited: set[int] = set()
     for i, node in enumerate(nodes):
         moved = [key for key, value in _IDENTITY.items() if node.get(key, value) != value]
@@ -121,7 +122,7 @@ def _accessor(document: Document, attributes: Mapping[str, Any], name: str) -> A
         or kind not in _KINDS
         or components not in _COMPONENTS
     ):
-        document.fail(f"{name} must be numbers or vectors, got {str(components)[:20]} of {str(kind)[:20]}")
+        document.fail(f"{name} must be numbers or vectors, got {shortened(components)} of {shortened(kind)}")
     dtype, width = np.dtype(_KINDS[kind]), _COMPONENTS[components]
     element = width * dtype.itemsize
     stride = document.integer(view, "byteStride", element)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from gsopt.config.from_json import MAX_JSON_NUMBER
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 from gsopt.events import to_json, write_atomic
 
 VERSION = 1
@@ -172,7 +172,7 @@ def set_from(document: Any) -> PromptSet:
         raise InputError('An object with a list `prompts` is needed. Write {"version": 1, "prompts": [...]}.')
     version = document.get("version")
     if version != VERSION or isinstance(version, bool):
-        raise InputError(f"Version {version!r:.80} of prompts is not known, only {VERSION}. Update gsopt.")
+        raise InputError(f"Version {shortened(version)} of prompts is not known, only {VERSION}. Update gsopt.")
     _require_known(document, ("version", *_names(PromptSet)), "The file")
     images = document.get("images", [])
     if len(document["prompts"]) > MAX_PROMPTS:
@@ -221,7 +221,7 @@ _T = TypeVar("_T")
 
 def _entry(kind: Callable[..., _T], values: Any, name: str, needed: str) -> _T:
     if not isinstance(values, dict) or needed not in values:
-        raise InputError(f"{name} must be an object with a `{needed}`, got {values!r:.80}. Correct it.")
+        raise InputError(f"{name} must be an object with a `{needed}`, got {shortened(values)}. Correct it.")
     _require_known(values, _names(kind), name)
     try:
         return kind(**values)
@@ -241,7 +241,7 @@ def _require_known(values: dict[str, Any], known: tuple[str, ...], name: str) ->
 
 def _require_text(value: Any, name: str, longest: int) -> None:
     if not isinstance(value, str):
-        raise InputError(f"`{name}` must be text, got {value!r:.80}. Put it in quotes.")
+        raise InputError(f"`{name}` must be text, got {shortened(value)}. Put it in quotes.")
     if len(value) > longest:
         raise InputError(f"`{name}` may have {longest} characters, got {len(value)} ({value[:30]!r}...). Shorten it.")
     control = next((c for c in value if unicodedata.category(c) in ("Cc", "Cs") and c not in "\n\t"), None)
@@ -251,29 +251,31 @@ def _require_text(value: Any, name: str, longest: int) -> None:
 
 def _require_number(value: Any, name: str, low: float, high: float) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < MAX_JSON_NUMBER:
-        raise InputError(f"`{name}` must be a number, got {value!r:.80}. Correct it.")
+        raise InputError(f"`{name}` must be a number, got {shortened(value)}. Correct it.")
     if not low <= value <= high:
         raise InputError(f"`{name}` must lie in [{low:g}, {high:g}], got {value}. Correct it.")
 
 
 def _require_one_of(value: Any, name: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise InputError(f"`{name}` must be one of {', '.join(allowed)}; got {value!r:.80}. Pick one.")
+        raise InputError(f"`{name}` must be one of {', '.join(allowed)}; got {shortened(value)}. Pick one.")
 
 
 def _require_source(value: Any) -> None:
     if not isinstance(value, str) or not SOURCE.fullmatch(value):
-        raise InputError(f"`source` of a prompt must be user, template or llm:MODEL, got {value!r:.80}. Correct it.")
+        raise InputError(
+            f"`source` of a prompt must be user, template or llm:MODEL, got {shortened(value)}. Correct it."
+        )
 
 
 def _require_file(value: Any, name: str) -> None:
     if not isinstance(value, str) or not FILE.fullmatch(value):
         raise InputError(
-            f"`{name}` must name a file beside prompts.json or one folder below, got {value!r:.80}. Letters, digits, "
-            "spaces, dots, - and _ may be used."
+            f"`{name}` must name a file beside prompts.json or one folder below, got {shortened(value)}. Letters, "
+            "digits, spaces, dots, - and _ may be used."
         )
 
 
 def _require_bool(value: Any, name: str) -> None:
     if not isinstance(value, bool):
-        raise InputError(f"`{name}` must be true or false, got {value!r:.80}. Correct it.")
+        raise InputError(f"`{name}` must be true or false, got {shortened(value)}. Correct it.")

@@ -13,7 +13,7 @@ from typing import Any
 
 from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
-from gsopt.errors import GsoptError, InputError, UsageError
+from gsopt.errors import GsoptError, InputError, UsageError, shortened
 from gsopt.events import EventWriter, to_json, write_atomic
 
 Listener = Callable[[Mapping[str, Any]], None]
@@ -156,7 +156,7 @@ def first_difference(old: dict[str, Any], new: dict[str, Any], where: str = "") 
         if name in FREE or new[key] == value:
             continue
         if not isinstance(value, dict):
-            return f"`{name}` was {value!r}, now {new[key]!r}"
+            return f"`{name}` was {shortened(value)}, now {shortened(new[key])}"
         if inner := first_difference(value, new[key], f"{name}."):
             return inner
     return None

@@ -14,7 +14,7 @@ from gsopt import check
 from gsopt.benchmark import schema
 from gsopt.benchmark.suite import arm_flags
 from gsopt.data.files import is_regular
-from gsopt.errors import InputError, UsageError
+from gsopt.errors import InputError, UsageError, shortened
 
 BUILT_IN_SUITES = ("sparse", "paper", "smoke")
 PACKAGE = Path(__file__).resolve().parents[2]
@@ -152,7 +152,7 @@ def parse(text: str, name: str) -> Suite:
 def _match(where: str, key: str, value: object) -> None:
     pattern, want = PATTERNS[key]
     if not re.fullmatch(pattern, str(value)):
-        raise InputError(f"`{where}.{key}` must be {want}, got {str(value)[:80]!r}. Correct the file.")
+        raise InputError(f"`{where}.{key}` must be {want}, got {shortened(value)}. Correct the file.")
 
 
 def _group(values: dict[str, Any], where: str) -> Group:
