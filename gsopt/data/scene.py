@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,11 @@ from gsopt.geometry.cameras import Cameras
 
 FAR_FROM_ORIGIN = 1e3
 """Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""
+MAX_COORDINATE = 1e18
+"""Its square is finite in float32."""
+FARTHEST_POINT = 1e6
+"""Points farther from their median than this many median distances are left out: in float32 they overflow, or all
+others fall on one place."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +125,7 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
         kind=dataset.kind,
         train=views[: len(train)],
         test=views[len(train) :],
-        points=_points(dataset, origin),
+        points=_points(dataset, origin, warnings),
         has_alpha=all(has_alpha[: len(train)]),
         warnings=tuple(warnings),
         origin=(float(origin[0]), float(origin[1]), float(origin[2])),
@@ -230,7 +236,15 @@ def _camera(frame: PosedImage, K: Tensor, origin: Tensor, image: ImageSource) ->
     return camera.validate()
 
 
-def _points(dataset: Dataset, origin: Tensor) -> Points | None:
+def _points(dataset: Dataset, origin: Tensor, warnings: list[str]) -> Points | None:
     if dataset.xyz is None or dataset.rgb is None or len(dataset.xyz) == 0:
         return None
-    return Points((dataset.xyz - origin).float(), dataset.rgb)
+    xyz = dataset.xyz - origin
+    distances = (xyz - xyz.median(0).values).norm(dim=1)
+    near = distances <= min(FARTHEST_POINT * float(distances.median()) or math.inf, MAX_COORDINATE)
+    if not bool(near.all()):
+        warnings.append(
+            f"{int((~near).sum()):,} of {len(xyz):,} points lie more than {FARTHEST_POINT:,.0f} times as far out as "
+            "half of them and are left out."
+        )
+    return Points(xyz[near].float(), dataset.rgb[near])

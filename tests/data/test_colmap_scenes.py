@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from gsopt.config.train import DataConfig
 from gsopt.data.colmap_files import CAMERA_MODELS
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
+from gsopt.init.neighbors import mean_neighbor_distance
 
 UNSUPPORTED = ("FOV", "RAD_TAN_THIN_PRISM_FISHEYE")
 
@@ -33,6 +35,32 @@ def test_poses_intrinsics_points_and_order(tmp_path: Path, suffix: str) -> None:
     assert scene.points is not None
     assert scene.points.xyz.tolist() == torch.tensor([xyz for xyz, _, _ in POINTS]).tolist()
     assert scene.points.rgb.tolist() == [rgb for _, rgb, _ in POINTS]
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300, -1e300, 1e40, 1e20, 1e12])
+def test_points_beyond_all_bounds_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, value: float
+) -> None:
+    """The run would end in NaN, or start with every other point on one place in float32."""
+    near = [([i % 5 / 5, i % 7 / 7, i % 11 / 11], [i, 0, 0], 0) for i in range(30)]
+    far = [([value, 0.0, 0.0], [255, 255, 255], 0), ([0.0, 1.0, value], [255, 255, 255], 2)]
+    monkeypatch.setattr("dataset_builders.POINTS", [far[0], *near, far[1]])
+    scene = load_scene(colmap(tmp_path, suffix=suffix))
+    assert scene.points is not None
+    assert scene.points.xyz.tolist() == torch.tensor([xyz for xyz, _, _ in near]).tolist()
+    assert scene.points.rgb.tolist() == [rgb for _, rgb, _ in near]
+    assert bool(mean_neighbor_distance(scene.points.xyz).isfinite().all())
+    if math.isfinite(value):
+        assert "2 of 32 points lie more than 1,000,000 times as far out as half of them" in scene.warnings[0]
+
+
+def test_points_on_one_place_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [([1.0, 2.0, 3.0], [i, 0, 0], 0) for i in range(5)]
+    monkeypatch.setattr("dataset_builders.POINTS", [*points, ([4.0, 2.0, 3.0], [9, 9, 9], 0)])
+    scene = load_scene(colmap(tmp_path))
+    assert scene.points is not None
+    assert len(scene.points.xyz) == 6
 
 
 def test_the_model_may_lie_in_sparse_itself(tmp_path: Path) -> None:

@@ -92,6 +92,14 @@ def set_key(key: str, value: object) -> Callable[[dict[str, Any]], None]:
     return lambda document: document.update({key: value})
 
 
+def without_focal(angle: float) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        del document["fl_x"]
+        document["camera_angle_x"] = angle
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -124,6 +132,10 @@ def test_a_broken_pose_names_its_frame(tmp_path: Path, change: Callable[..., Non
         (set_key("fl_x", float("nan")), "`fl_x` of frame"),
         (set_key("fl_x", 10**400), "`fl_x` of frame"),
         (lambda d: d.pop("fl_x"), "neither `fl_x` nor `camera_angle_x`"),
+        (without_focal(0.0), r"`camera_angle_x` of .* must be in \(0, pi\) radians, got 0"),
+        (without_focal(-0.5), r"`camera_angle_x` of .* must be in \(0, pi\) radians, got -0.5"),
+        (without_focal(3.1416), r"`camera_angle_x` of .* must be in \(0, pi\) radians, got 3.1416"),
+        (without_focal(4.0), r"`camera_angle_x` of .* must be in \(0, pi\) radians, got 4.0"),
         (set_key("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
         (set_key("k1", -5000), "folds back"),
         (set_key("ply_file_path", "images/000.png"), "not a PLY file"),

@@ -86,6 +86,24 @@ def test_sixteen_bit_gray_is_scaled_not_clipped(tmp_path: Path) -> None:
     assert read_pixels(tmp_path / "a.png").unique().tolist() == [0x80]
 
 
+def test_a_dark_photo_of_sixteen_bits_stays_dark(tmp_path: Path) -> None:
+    """Small numbers are a mask's 0 and 1, or 0 and 255, only in a mask."""
+    Image.fromarray(np.array([[0, 100], [200, 255]], dtype=np.uint16)).save(tmp_path / "a.png")
+    assert not bool(read_pixels(tmp_path / "a.png").any())
+
+
+@pytest.mark.parametrize("mode", ["P", "L", "RGB"])
+def test_a_transparent_color_is_alpha(tmp_path: Path, mode: str) -> None:
+    """PNG's tRNS chunk, without a channel of its own."""
+    image = Image.new(mode, (3, 2))
+    if mode == "P":
+        image.putpalette(bytes(range(30)))
+    image.putpixel((1, 0), (9, 9, 9) if mode == "RGB" else 9)
+    image.save(tmp_path / "a.png", transparency=(9, 9, 9) if mode == "RGB" else 9)
+    assert read_header(tmp_path / "a.png") == (3, 2, True)
+    assert read_pixels(tmp_path / "a.png")[..., 3].tolist() == [[255, 0, 255], [255, 255, 255]]
+
+
 def test_a_truncated_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "cut.png"
     save_image(path)

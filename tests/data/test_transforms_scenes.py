@@ -83,6 +83,7 @@ def test_a_distorted_capture_is_undistorted(tmp_path: Path, model: str) -> None:
     lens = source.undistortion.lens
     assert lens.fisheye == (model == "OPENCV_FISHEYE")
     assert lens.radial == (0.05, -0.02, 0.0, 0.0)
+    assert lens.tangential == ((0.0, 0.0) if lens.fisheye else (0.001, 0.002))
     again = choose_pinhole(lens, source.undistortion.K, SIZE, SIZE, "")
     assert torch.equal(again.pinhole.float(), view.camera.Ks[0])
 
@@ -121,6 +122,13 @@ def test_test_filenames_are_held_out(tmp_path: Path) -> None:
     scene = load_scene(nerfstudio(tmp_path, test_filenames=["images/004.png"]))
     assert [view.name for view in scene.test] == ["images/004.png"]
     assert len(scene.train) == 9
+
+
+def test_val_filenames_are_neither_input_nor_held_out_views(tmp_path: Path) -> None:
+    nerfstudio(tmp_path, test_filenames=["images/004.png"], val_filenames=["images/001.png", "images/004.png"])
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.test] == ["images/004.png"]
+    assert [view.name for view in scene.train] == [f"images/{i:03d}.png" for i in range(10) if i not in (1, 4)]
 
 
 @pytest.mark.parametrize("text", [False, True])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from dataset_builders import nerf_synthetic, nerfstudio
+from dataset_builders import nerf_synthetic, nerfstudio, read_document, write_json
 
 from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
@@ -42,9 +42,9 @@ def test_view_ids_count_in_name_order_after_the_hold_out_elsewhere(tmp_path: Pat
     ("settings", "message"),
     [
         ({"view_ids": (10,)}, "names 10, but ids go from 0 to 9"),
-        ({"view_ids": (-1,)}, "view-ids"),
+        ({"view_ids": (-1,)}, "view_ids"),
         ({"view_ids": (3, 3)}, "twice"),
-        ({"view_ids": ()}, "view-ids"),
+        ({"view_ids": ()}, "view_ids"),
         ({"views": 11}, "at most the 10 input views there are, got 11"),
     ],
 )
@@ -56,6 +56,17 @@ def test_impossible_choices_are_refused(tmp_path: Path, settings: dict[str, obje
 def test_one_image_that_is_held_out_leaves_nothing_to_choose_from(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no input view left"):
         load_scene(DataConfig(path=str(nerfstudio(tmp_path, count=1)), eval=True, view_ids=(0,)))
+
+
+def test_every_eighth_is_held_out_by_name_whatever_the_order_of_the_file(tmp_path: Path) -> None:
+    root = nerf_synthetic(tmp_path)
+    (root / "transforms_test.json").unlink()
+    document = read_document(root, "transforms_train.json")
+    document["frames"] = document["frames"][5:] + document["frames"][:5]
+    write_json(root, document, "transforms_train.json")
+    scene = load_scene(DataConfig(path=str(root), eval=True))
+    assert [view.name for view in scene.test] == ["train/r_0.png", "train/r_8.png"]
+    assert [view.name for view in scene.train] == [f"train/r_{i}.png" for i in (5, 6, 7, 9, 1, 2, 3, 4)]
 
 
 def test_the_test_views_stay_whatever_is_chosen(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def _decoded(av: ModuleType, video: Path) -> Iterator[tuple[int, Any]]:
     """Every frame that can be decoded; a file that breaks off is read up to there."""
     index = 0
     try:
-        with av.open(str(video)) as container:
+        with av.open(str(video), metadata_errors="replace") as container:
             if not container.streams.video:
                 raise InputError(f"{video} holds no video track, only sound or data. Give another file.")
             for frame in container.decode(video=0):

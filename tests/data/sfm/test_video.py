@@ -16,8 +16,9 @@ from gsopt.errors import InputError
 av = pytest.importorskip("av", reason="the extra sfm is not installed")
 
 
-def film(path: Path, pictures: list[Image.Image]) -> Path:
+def film(path: Path, pictures: list[Image.Image], **metadata: str) -> Path:
     with av.open(str(path), "w") as container:
+        container.metadata.update(metadata)
         stream = container.add_stream("libx264", rate=Fraction(10), options={"crf": "12"})
         stream.width, stream.height = pictures[0].size
         stream.pix_fmt = "yuv420p"
@@ -36,6 +37,17 @@ def pan() -> list[Image.Image]:
     """A window of 320 x 240 that slides by 4 px a frame, 0.0125 of its longer side."""
     texture = room.textures(3)[0].resize((700, 480))
     return [texture.crop((4 * i, 80, 4 * i + 320, 320)) for i in range(60)]
+
+
+def test_a_title_that_is_no_utf8_does_not_matter(pan: list[Image.Image], tmp_path: Path) -> None:
+    plain = film(tmp_path / "plain.mkv", pan[:8], title="Vacances d'ete")
+    (tmp_path / "titled.mkv").write_bytes(plain.read_bytes().replace(b"d'ete", b"d'\xe9t\xe9"))
+    with pytest.raises(UnicodeDecodeError), av.open(str(tmp_path / "titled.mkv")):
+        pass
+    chosen = extract_frames(tmp_path / "titled.mkv", tmp_path / "frames", 150)
+    same = extract_frames(plain, tmp_path / "again", 150)
+    assert [path.name for path in chosen.paths] == [path.name for path in same.paths]
+    assert chosen.decoded == 8
 
 
 def test_frames_are_apart_by_the_motion_asked_for(pan: list[Image.Image], tmp_path: Path) -> None:
