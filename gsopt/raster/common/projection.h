@@ -42,8 +42,8 @@ template <class F> struct Rotation {
 template <class F> inline Rotation<F> rotation(F w, F x, F y, F z) {
   const F one = splat<F>(1.f);
   return {{one - (y * y + z * z) * 2.f, (x * y + w * z) * 2.f, (x * z - w * y) * 2.f},
-          {(x * y - w * z) * 2.f, one - (x * x + z * z) * 2.f, (y * z + w * x) * 2.f},
-          {(x * z + w * y) * 2.f, (y * z - w * x) * 2.f, one - (x * x + y * y) * 2.f}};
+      {(x * y - w * z) * 2.f, one - (x * x + z * z) * 2.f, (y * z + w * x) * 2.f},
+      {(x * z + w * y) * 2.f, (y * z - w * x) * 2.f, one - (x * x + y * y) * 2.f}};
 }
 
 // One Gaussian (or a vector of them) as the optimizer stores it.
@@ -137,8 +137,8 @@ template <class F> struct SplatGradient {
 };
 
 // Equations (12) to (16).
-template <class F> inline Splat3D<F> project_backward(const Camera& cam, const Projected<F>& p, const Whitening<F>& L,
-                                                      const SplatGradient<F>& v) {
+template <class F> inline Splat3D<F> project_backward(
+    const Camera& cam, const Projected<F>& p, const Whitening<F>& L, const SplatGradient<F>& v) {
   // JW and M of project(), whitened: dLoss/d(cov2d) is half of Lᵀ [uu uv; uv vv] L, so that L never has to be undone.
   const Vec3<F> JW0 = p.JW0 * L.A + p.JW1 * L.B, JW1 = p.JW1 * L.C;
   // A M0 + B M1 without its difference: M1·M1 M0 - M0·M1 M1 = M1 x (M0 x M1).

@@ -75,9 +75,8 @@ inline void count_stage(Pool& pool, Frame& frame, int chunks) {
   parallel(pool, chunks, [&](int chunk, int) {
     uint32_t* mine = counts + static_cast<int64_t>(chunk) * tiles;
     std::memset(mine, 0, sizeof(uint32_t) * tiles);
-    for_each_cover(frame, chunk, chunks, [&](uint32_t id, const Cover& cover) {
-      for_each_tile(frame, cover, id, [&](int tile) { ++mine[tile]; });
-    });
+    for_each_cover(frame, chunk, chunks,
+        [&](uint32_t id, const Cover& cover) { for_each_tile(frame, cover, id, [&](int tile) { ++mine[tile]; }); });
   });
 }
 

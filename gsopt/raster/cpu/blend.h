@@ -15,8 +15,8 @@ struct alignas(64) BlockState {
 };
 
 // The alphas (7) of n splats at the pixels of a block; 0 where they are not drawn.
-inline void alphas_of(const Local& local, const Touched& touched, const uint8_t* list, int n, int block,
-                      px alphas[kBatch]) {
+inline void alphas_of(
+    const Local& local, const Touched& touched, const uint8_t* list, int n, int block, px alphas[kBatch]) {
   const px X = load_px(kBlockPixels.x[block]), Y = load_px(kBlockPixels.y[block]);
   for (int j = 0; j < n; ++j) {
     const int i = list[j];
@@ -27,9 +27,8 @@ inline void alphas_of(const Local& local, const Touched& touched, const uint8_t*
 
 // Blends the splats of a list into a block by (8), `first` being the number of the chunk's first splat. True when all
 // its pixels have become opaque.
-template <bool Depth, bool Count>
-inline bool blend_block(const Local& local, const Touched& touched, const SplatList& list, int first, int block,
-                        bool stop, BlockState& s, Work& work) {
+template <bool Depth, bool Count> inline bool blend_block(const Local& local, const Touched& touched,
+    const SplatList& list, int first, int block, bool stop, BlockState& s, Work& work) {
   const px t_min = splat<px>(kTransmittanceMin);
   // T goes on behind the splat at which a pixel became opaque, so that no splat waits for that; T_end does not.
   px T = load_px(s.T), T_end = T, depth = load_px(s.depth);
@@ -68,9 +67,8 @@ inline bool blend_block(const Local& local, const Touched& touched, const SplatL
 
 // Blends a chunk of n splats, `first` being the number of the first in its tile. Returns the blocks that are not opaque
 // yet; `touched` keeps the blocks that each splat changed.
-template <bool Depth, bool Count>
-inline uint32_t blend_chunk(const Local& local, int n, int first, uint32_t alive, bool stop, Touched& touched,
-                            BlockState* states, Work& work) {
+template <bool Depth, bool Count> inline uint32_t blend_chunk(
+    const Local& local, int n, int first, uint32_t alive, bool stop, Touched& touched, BlockState* states, Work& work) {
   SplatList list;
   for (uint32_t rest = alive; rest; rest &= rest - 1) {
     const int block = __builtin_ctz(rest);
@@ -88,14 +86,14 @@ inline void write_block(const Frame& frame, const ForwardOutput& out, int tile, 
   for_each_row(frame, tile, block, [&](int64_t pixel, int lane, int n) {
     const f4 T = load4(s.T + lane);
     store_rgb(out.colors + 3 * pixel,
-              {load4(s.r + lane) + T * bg[0], load4(s.g + lane) + T * bg[1], load4(s.b + lane) + T * bg[2]}, n);
+        {load4(s.r + lane) + T * bg[0], load4(s.g + lane) + T * bg[1], load4(s.b + lane) + T * bg[2]}, n);
     store4_first(out.alphas + pixel, 1.f - T, n);
     if (out.depths) store4_first(out.depths + pixel, load4(s.depth + lane), n);
   });
 }
 
-template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int tile, const ForwardOutput& out,
-                                                         Work& work) {
+template <bool Depth, bool Count>
+inline void blend_tile(const Frame& frame, int tile, const ForwardOutput& out, Work& work) {
   const uint32_t begin = frame.tile_begin.as<uint32_t>()[tile], end = frame.tile_begin.as<uint32_t>()[tile + 1];
   uint32_t* masks = frame.masks.as<uint32_t>();
   const TileGeometry geometry = tile_geometry(frame, tile);
@@ -114,8 +112,8 @@ template <bool Depth, bool Count> inline void blend_tile(const Frame& frame, int
     load_chunk(frame, frame.entries.as<Entry>() + k, n, geometry, local);
     prefetch_records(frame, k + n, k + n + kChunk);
     find_touched(local, n, alive, !frame.skips.tiles, touched);
-    alive = blend_chunk<Depth, Count>(local, n, static_cast<int>(k - begin) + 1, alive, frame.skips.termination,
-                                      touched, states, work);
+    alive = blend_chunk<Depth, Count>(
+        local, n, static_cast<int>(k - begin) + 1, alive, frame.skips.termination, touched, states, work);
     std::memcpy(masks + k, touched.blocks, sizeof(uint32_t) * n);
     k += n;
   }

@@ -52,9 +52,8 @@ inline void alphas_of(const Local::Row& s, uint32_t mask, Alphas& out) {
 }
 
 // The row of splat `i` of a chunk, entry `index` (one-based) of its tile: the sums of (10) and (11) over blocks.
-template <bool Depth, bool Abs>
-inline void blend_splat_backward(const Local& local, int i, int index, uint32_t mask, BlockGradient* grads,
-                                 float* row) {
+template <bool Depth, bool Abs> inline void blend_splat_backward(
+    const Local& local, int i, int index, uint32_t mask, BlockGradient* grads, float* row) {
   const Local::Row& splat_i = local.row[i];
   const px B = splat<px>(splat_i.B), C = splat<px>(splat_i.C);
   const Vec3<px> color = splat_color(local, i);
@@ -92,7 +91,7 @@ inline void blend_splat_backward(const Local& local, int i, int index, uint32_t 
   }
   const px scale = splat<px>(1.f / kHalfLog2E);
   store_sums(row, {s0, su, sv, suu, suv, svv, v_color.x, v_color.y, v_color.z, v_depth,
-                   abs_x * splat<px>(splat_i.A) * scale, abs_y * scale});
+                      abs_x * splat<px>(splat_i.A) * scale, abs_y * scale});
 }
 
 template <bool Depth, bool Abs> inline void blend_tile_backward(const Frame& frame, int tile, const BackwardInput& in) {

@@ -40,7 +40,7 @@ inline Calibration calibrate() {
   volatile float half = 0.5f, tenth = 0.1f;
   const px a = splat<px>(half), b = splat<px>(tenth);
   return {lanes_per_second<10>([a, b](px x) { return x * a + b; }),
-          lanes_per_second<6>([](px x) { return exp2(splat<px>(0.f) - x); })};
+      lanes_per_second<6>([](px x) { return exp2(splat<px>(0.f) - x); })};
 }
 
 }  // namespace gsopt::GSOPT_ISA

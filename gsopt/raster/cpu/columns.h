@@ -39,10 +39,10 @@ GSOPT_SHUFFLE(twos_high, 2, 3, 10, 11, 6, 7, 14, 15)
 GSOPT_SHUFFLE(fours_low, 0, 1, 2, 3, 8, 9, 10, 11)
 GSOPT_SHUFFLE(fours_high, 4, 5, 6, 7, 12, 13, 14, 15)
 #else
-#define GSOPT_SHUFFLE(name, a0, a1, a2, a3)                                         \
-  inline wide name(wide a, wide b) {                                                \
-    return joined(__builtin_shufflevector(four(a, 0), four(b, 0), a0, a1, a2, a3),  \
-                  __builtin_shufflevector(four(a, 1), four(b, 1), a0, a1, a2, a3)); \
+#define GSOPT_SHUFFLE(name, a0, a1, a2, a3)                                        \
+  inline wide name(wide a, wide b) {                                               \
+    return joined(__builtin_shufflevector(four(a, 0), four(b, 0), a0, a1, a2, a3), \
+        __builtin_shufflevector(four(a, 1), four(b, 1), a0, a1, a2, a3));          \
   }
 GSOPT_SHUFFLE(mixed_low, 0, 4, 1, 5)
 GSOPT_SHUFFLE(mixed_high, 2, 6, 3, 7)

@@ -19,8 +19,16 @@ namespace gsopt::GSOPT_ISA {
 
 extern const Kernels kernels;
 const Kernels kernels = {
-    GSOPT_STRING(GSOPT_ISA), project_stage,     bin_stage,  blend_stage, blend_backward_stage,
-    project_backward_stage,  photometric_stage, adam_stage, match_stage, calibrate,
+    GSOPT_STRING(GSOPT_ISA),
+    project_stage,
+    bin_stage,
+    blend_stage,
+    blend_backward_stage,
+    project_backward_stage,
+    photometric_stage,
+    adam_stage,
+    match_stage,
+    calibrate,
 };
 
 }  // namespace gsopt::GSOPT_ISA

@@ -22,7 +22,7 @@ inline f8 bilinear8(const float* corners, int width, int height, f8 column, f8 r
   f8 pair[4];
   for (int k = 0; k < 4; ++k)
     pair[k] = __builtin_shufflevector(load4(corners + 4 * static_cast<int64_t>(cell[k])),
-                                      load4(corners + 4 * static_cast<int64_t>(cell[k + 4])), 0, 1, 2, 3, 4, 5, 6, 7);
+        load4(corners + 4 * static_cast<int64_t>(cell[k + 4])), 0, 1, 2, 3, 4, 5, 6, 7);
   const auto low = [](f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13); };
   const auto high = [](f8 a, f8 b) { return __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15); };
   const auto first = [](f8 a, f8 b) { return __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13); };

@@ -108,20 +108,14 @@ Parameters parameters_of(const Model& m, int sh_degree) {
   if (rest > kMaxBands) throw std::invalid_argument("shN holds more than the bands of degree 3");
   if ((sh_degree + 1) * (sh_degree + 1) - 1 > rest && n)
     throw std::invalid_argument("shN holds fewer bands than sh_degree asks for");
-  return {static_cast<int64_t>(n),
-          sh_degree,
-          rest,
-          data_of(m.means, 3 * n, "means"),
-          data_of(m.quats, 4 * n, "quats"),
-          data_of(m.log_scales, 3 * n, "log_scales"),
-          m.logit_opacities.data(),
-          data_of(m.sh0, 3 * n, "sh0"),
-          data_of(m.shN, 3 * n * rest, "shN")};
+  return {static_cast<int64_t>(n), sh_degree, rest, data_of(m.means, 3 * n, "means"), data_of(m.quats, 4 * n, "quats"),
+      data_of(m.log_scales, 3 * n, "log_scales"), m.logit_opacities.data(), data_of(m.sh0, 3 * n, "sh0"),
+      data_of(m.shN, 3 * n * rest, "shN")};
 }
 
 // viewmat [4,4], K [3,3] row-major double: the center is found in double so that far-away scenes keep their precision.
 Camera make_camera(const std::vector<double>& V, const std::vector<double>& K, int width, int height, double near_plane,
-                   double far_plane, double eps2d, bool antialiased) {
+    double far_plane, double eps2d, bool antialiased) {
   if (V.size() != 16 || K.size() != 9 || width < 1 || height < 1)
     throw std::invalid_argument("camera: wrong number of elements");
   Camera c;
@@ -177,14 +171,13 @@ struct Image {
 };
 
 void forward(Workspace& ws, Frame& frame, const Model& model, const Camera& camera, const Image& image, int sh_degree,
-             const std::array<float, 3>& background) {
+    const std::array<float, 3>& background) {
   std::vector<Work> work(ws.count_work ? ws.pool.threads() : 0);
   const Parameters P = parameters_of(model, sh_degree);
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
   const ForwardOutput out = {data_of(image.colors, 3 * pixels, "colors"), data_of(image.alphas, pixels, "alphas"),
-                             image.depths ? data_of(*image.depths, pixels, "depths") : nullptr,
-                             data_of(image.radii, 2 * static_cast<size_t>(P.count), "radii"),
-                             ws.count_work ? work.data() : nullptr};
+      image.depths ? data_of(*image.depths, pixels, "depths") : nullptr,
+      data_of(image.radii, 2 * static_cast<size_t>(P.count), "radii"), ws.count_work ? work.data() : nullptr};
   nb::gil_scoped_release release;
   frame.camera = camera;
   std::copy(background.begin(), background.end(), frame.background);
@@ -217,39 +210,29 @@ struct Gradient {
 };
 
 void backward(Workspace& ws, Frame& frame, const Model& model, In v_colors, std::optional<In> v_alphas,
-              std::optional<In> v_depths, Gradient& g) {
+    std::optional<In> v_depths, Gradient& g) {
   const Parameters P = parameters_of(model, frame.sh_degree);
   if (P.count != frame.count) throw std::invalid_argument("backward: not the Gaussians that the frame was drawn from");
   const size_t n = static_cast<size_t>(P.count), pixels = static_cast<size_t>(frame.camera.width) * frame.camera.height;
   const BackwardInput in = {data_of(v_colors, 3 * pixels, "v_colors"),
-                            v_alphas ? data_of(*v_alphas, pixels, "v_alphas") : nullptr,
-                            v_depths ? data_of(*v_depths, pixels, "v_depths") : nullptr};
-  const ParameterGradients out = {data_of(g.means, 3 * n, "v_means"),
-                                  data_of(g.quats, 4 * n, "v_quats"),
-                                  data_of(g.log_scales, 3 * n, "v_log_scales"),
-                                  data_of(g.logit_opacities, n, "v_logit_opacities"),
-                                  data_of(g.sh0, 3 * n, "v_sh0"),
-                                  g.shN ? data_of(*g.shN, 3 * n * P.sh_rest, "v_shN") : nullptr,
-                                  data_of(g.means2d, 2 * n, "v_means2d"),
-                                  g.means2d_abs ? data_of(*g.means2d_abs, 2 * n, "v_means2d_abs") : nullptr};
+      v_alphas ? data_of(*v_alphas, pixels, "v_alphas") : nullptr,
+      v_depths ? data_of(*v_depths, pixels, "v_depths") : nullptr};
+  const ParameterGradients out = {data_of(g.means, 3 * n, "v_means"), data_of(g.quats, 4 * n, "v_quats"),
+      data_of(g.log_scales, 3 * n, "v_log_scales"), data_of(g.logit_opacities, n, "v_logit_opacities"),
+      data_of(g.sh0, 3 * n, "v_sh0"), g.shN ? data_of(*g.shN, 3 * n * P.sh_rest, "v_shN") : nullptr,
+      data_of(g.means2d, 2 * n, "v_means2d"),
+      g.means2d_abs ? data_of(*g.means2d_abs, 2 * n, "v_means2d_abs") : nullptr};
   nb::gil_scoped_release release;
   frame.rows.reserve(sizeof(float) * kRow * frame.intersections);
   timed(ws, "blend_backward", [&] { ws.kernels->blend_backward(ws.pool, frame, in, out.means2d_abs != nullptr); });
   timed(ws, "project_backward", [&] { ws.kernels->project_backward(ws.pool, frame, P, out); });
 }
 
-std::tuple<double, double> photometric(Workspace& ws, In rendered, In target, Out v_rendered, int height, int width,
-                                       float lambda_dssim) {
+std::tuple<double, double> photometric(
+    Workspace& ws, In rendered, In target, Out v_rendered, int height, int width, float lambda_dssim) {
   const size_t size = 3 * static_cast<size_t>(height) * width;
-  PhotometricArguments a = {data_of(rendered, size, "rendered"),
-                            data_of(target, size, "target"),
-                            data_of(v_rendered, size, "v_rendered"),
-                            height,
-                            width,
-                            lambda_dssim,
-                            &ws.scratch,
-                            0,
-                            0};
+  PhotometricArguments a = {data_of(rendered, size, "rendered"), data_of(target, size, "target"),
+      data_of(v_rendered, size, "v_rendered"), height, width, lambda_dssim, &ws.scratch, 0, 0};
   nb::gil_scoped_release release;
   timed(ws, "photometric", [&] { ws.kernels->photometric(ws.pool, a); });
   return {a.l1, a.ssim};
@@ -263,21 +246,14 @@ struct AdamStep {
 };
 
 void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_avg_sq, const AdamStep& step,
-          const Camera& camera, int sh_degree) {
+    const Camera& camera, int sh_degree) {
   const Parameters P = parameters_of(model, sh_degree);
   if (P.count == 0) return;
-  AdamArguments a = {P.count,
-                     static_cast<float>(step.beta1),
-                     static_cast<float>(step.beta2),
-                     static_cast<float>(step.eps),
-                     {},
-                     {},
-                     P.means,
-                     data_of(g.sh0, 3 * static_cast<size_t>(P.count), "v_sh0"),
-                     camera,
-                     sh_degree};
-  const std::array<Out*, 6> gradients = {&g.means,           &g.quats, &g.log_scales,
-                                         &g.logit_opacities, &g.sh0,   g.shN ? &*g.shN : nullptr};
+  AdamArguments a = {P.count, static_cast<float>(step.beta1), static_cast<float>(step.beta2),
+      static_cast<float>(step.eps), {}, {}, P.means, data_of(g.sh0, 3 * static_cast<size_t>(P.count), "v_sh0"), camera,
+      sh_degree};
+  const std::array<Out*, 6> gradients = {
+      &g.means, &g.quats, &g.log_scales, &g.logit_opacities, &g.sh0, g.shN ? &*g.shN : nullptr};
   for (int k = 0; k < 6; ++k) {
     Out &param = *model.all()[k], &m = *exp_avg.all()[k], &v = *exp_avg_sq.all()[k];
     const size_t size = param.size();
@@ -285,13 +261,9 @@ void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_a
     const double t = static_cast<double>(step.steps[k]);
     const double correction1 = 1.0 - std::pow(step.beta1, t), correction2 = 1.0 - std::pow(step.beta2, t);
     AdamParameter& out = gradients[k] ? a.others[k] : a.bands;
-    out = {param.data(),
-           data_of(m, size, "exp_avg"),
-           data_of(v, size, "exp_avg_sq"),
-           gradients[k] ? data_of(*gradients[k], size, "grad") : nullptr,
-           static_cast<int64_t>(size) / P.count,
-           static_cast<float>(step.lr[k] / correction1),
-           static_cast<float>(1.0 / std::sqrt(correction2))};
+    out = {param.data(), data_of(m, size, "exp_avg"), data_of(v, size, "exp_avg_sq"),
+        gradients[k] ? data_of(*gradients[k], size, "grad") : nullptr, static_cast<int64_t>(size) / P.count,
+        static_cast<float>(step.lr[k] / correction1), static_cast<float>(1.0 / std::sqrt(correction2))};
   }
   nb::gil_scoped_release release;
   timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
@@ -305,27 +277,15 @@ struct Windows {
 
 // A: 9 and T: 3 floats; costs and each third of `planes` have one element per ray.
 void match(Workspace& ws, const Windows& w, In corners, int height, int width, const std::vector<float>& A,
-           const std::vector<float>& T, In planes, Out costs) {
+    const std::vector<float>& T, In planes, Out costs) {
   const size_t padded = costs.size(), taps = w.offsets.size() / 2;
   if (A.size() != 9 || T.size() != 3 || padded % 8 || width < 2 || height < 2)
     throw std::invalid_argument("match: wrong number of elements");
-  MatchArguments a = {static_cast<int64_t>(padded),
-                      static_cast<int>(taps),
-                      w.offsets.data(),
-                      data_of(w.rays, 2 * padded, "rays"),
-                      data_of(w.windows, 2 * taps * padded, "windows"),
-                      data_of(w.inverse_deviation, padded, "inverse_deviation"),
-                      data_of(planes, 3 * padded, "planes"),
-                      data_of(corners, 4 * static_cast<size_t>(height) * width, "corners"),
-                      width,
-                      height,
-                      {},
-                      {},
-                      w.step_x,
-                      w.step_y,
-                      w.least_variance,
-                      w.unseen,
-                      costs.data()};
+  MatchArguments a = {static_cast<int64_t>(padded), static_cast<int>(taps), w.offsets.data(),
+      data_of(w.rays, 2 * padded, "rays"), data_of(w.windows, 2 * taps * padded, "windows"),
+      data_of(w.inverse_deviation, padded, "inverse_deviation"), data_of(planes, 3 * padded, "planes"),
+      data_of(corners, 4 * static_cast<size_t>(height) * width, "corners"), width, height, {}, {}, w.step_x, w.step_y,
+      w.least_variance, w.unseen, costs.data()};
   std::copy(A.begin(), A.end(), a.A);
   std::copy(T.begin(), T.end(), a.T);
   nb::gil_scoped_release release;
@@ -347,10 +307,10 @@ NB_MODULE(_cpu, m) {
       .def_ro("seconds", &Workspace::seconds)
       .def_ro("cpu_seconds", &Workspace::cpu_seconds)
       .def("calibrate",
-           [](const Workspace& w) {
-             const Calibration c = w.kernels->calibrate();
-             return std::tuple(c.fma, c.exp);
-           })
+          [](const Workspace& w) {
+            const Calibration c = w.kernels->calibrate();
+            return std::tuple(c.fma, c.exp);
+          })
       .def_rw("count_work", &Workspace::count_work)
       .def_rw("max_entries", &Workspace::max_entries)
       .def_prop_rw(
@@ -367,7 +327,7 @@ NB_MODULE(_cpu, m) {
       .def_ro("intersections", &Frame::intersections);
   nb::class_<Camera>(m, "Camera")
       .def("__init__", [](Camera* self, const std::vector<double>& V, const std::vector<double>& K, int width,
-                          int height, double near_plane, double far_plane, double eps2d, bool antialiased) {
+                           int height, double near_plane, double far_plane, double eps2d, bool antialiased) {
         new (self) Camera(make_camera(V, K, width, height, near_plane, far_plane, eps2d, antialiased));
       });
   // noconvert: what is to be written must not be a copy.
@@ -378,17 +338,17 @@ NB_MODULE(_cpu, m) {
   using MaybeOut = std::optional<Out>;
   nb::class_<Gradient>(m, "Gradient")
       .def(nb::init<Out, Out, Out, Out, Out, MaybeOut, Out, MaybeOut>(), out, out, out, out, out, out_or_none, out,
-           out_or_none);
+          out_or_none);
   nb::class_<Image>(m, "Image").def(nb::init<Out, Out, MaybeOut, OutInt>(), out, out, out_or_none, out);
   nb::class_<AdamStep>(m, "AdamStep")
       .def(nb::init<std::array<double, 6>, std::array<int64_t, 6>, double, double, double>(), nb::kw_only(),
-           nb::arg("lr"), nb::arg("steps"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"));
+          nb::arg("lr"), nb::arg("steps"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"));
   m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::kw_only(), nb::arg("sh_degree"),
-        nb::arg("background"));
+      nb::arg("background"));
   m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), in_or_none, in_or_none, nb::arg());
   m.def("photometric", &photometric);
   m.def("adam", &adam, nb::arg(), nb::arg(), nb::arg(), nb::kw_only(), nb::arg("exp_avg"), nb::arg("exp_avg_sq"),
-        nb::arg("step"), nb::arg("camera"), nb::arg("sh_degree"));
+      nb::arg("step"), nb::arg("camera"), nb::arg("sh_degree"));
   nb::class_<Windows>(m, "Windows").def(nb::init<In, In, In, In, float, float, float, float>());
   m.def("match", &match);
 }

@@ -36,12 +36,8 @@ struct Band {
   // With what its filtered rows need around it; it begins at an even row, as every pair of rows does.
   Band grown() const {
     const int left = x0 < kHalo ? 0 : x0 - kHalo, right = x0 + n + kHalo > width ? width : x0 + n + kHalo;
-    return {y0 < kRadius + 1 ? 0 : y0 - kRadius - 1,
-            y1 + kRadius > height ? height : y1 + kRadius,
-            left,
-            right - left,
-            width,
-            height};
+    return {y0 < kRadius + 1 ? 0 : y0 - kRadius - 1, y1 + kRadius > height ? height : y1 + kRadius, left, right - left,
+        width, height};
   }
 };
 
@@ -159,7 +155,7 @@ inline double total(wide v) {
 
 // Two rows of SSIM's partials from y on, into three maps; SSIM itself is summed over rows and floats of `inner`.
 inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&images)[2], const Image (&maps)[3],
-                      const Band& inner, double* row_ssim) {
+    const Band& inner, double* row_ssim) {
   columns.fill(y, images, [](const wide* in, wide* value) {
     const wide x = in[0], target = in[1];
     value[0] = x;
@@ -173,7 +169,7 @@ inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&i
     for (int i = 0; i < b.n; i += kWide) {
       wide d[3];
       store_wide(ssim + i, ssim_partials(columns.filter(r, 0, i), columns.filter(r, 1, i), columns.filter(r, 2, i),
-                                         columns.filter(r, 3, i), d[0], d[1], d[2]));
+                               columns.filter(r, 3, i), d[0], d[1], d[2]));
       store_first(mean + i, d[0], b.n - i);
       store_first(square + i, d[1], b.n - i);
       store_first(product + i, d[2], b.n - i);
@@ -188,8 +184,8 @@ inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&i
 
 // Two rows of the gradient from y on. The window is symmetric, so its transpose is itself:
 // v = F(d_mean) + 2 x F(d_square) + y F(d_product), (21).
-inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y,
-                          const Image (&maps)[3], double* row_l1) {
+inline void gradient_rows(
+    Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y, const Image (&maps)[3], double* row_l1) {
   const double count = static_cast<double>(b.width) * b.height;
   const wide w_l1 = splat<wide>(static_cast<float>((1.0 - a.lambda_dssim) / count)),
              w_ssim = splat<wide>(static_cast<float>(-a.lambda_dssim / count));
@@ -213,15 +209,14 @@ inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, co
 }
 
 // The partials run ahead of the gradient by the rows that its window reaches.
-inline void photometric_band(const PhotometricArguments& a, const Band& b, float* ring, double* row_ssim,
-                             double* row_l1) {
+inline void photometric_band(
+    const PhotometricArguments& a, const Band& b, float* ring, double* row_ssim, double* row_l1) {
   const Band around = b.grown();
   const int64_t stride = kRingStride;
-  const Image images[2] = {{const_cast<float*>(a.rendered), b.width, 1 << 30, 0},
-                           {const_cast<float*>(a.target), b.width, 1 << 30, 0}};
-  const Image maps[3] = {{ring, stride, kRing, around.x0},
-                         {ring + kRing * stride, stride, kRing, around.x0},
-                         {ring + 2 * kRing * stride, stride, kRing, around.x0}};
+  const Image images[2] = {
+      {const_cast<float*>(a.rendered), b.width, 1 << 30, 0}, {const_cast<float*>(a.target), b.width, 1 << 30, 0}};
+  const Image maps[3] = {{ring, stride, kRing, around.x0}, {ring + kRing * stride, stride, kRing, around.x0},
+      {ring + 2 * kRing * stride, stride, kRing, around.x0}};
   Columns<4> ahead(around);
   Columns<3> columns(b);
   int next = around.y0;

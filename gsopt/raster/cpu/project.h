@@ -30,13 +30,8 @@ inline Splat3D<wide> load_splats(const Parameters& P, const int64_t index[kWide]
   for (int l = 0; l < kWide; ++l) logits[l] = P.logit_opacities[index[l]];
   wide q[4];
   load_fours([&](int l) { return load4(P.quats + 4 * index[l]); }, q);
-  return {load_vec3(P.means, index, P.count),
-          q[0],
-          q[1],
-          q[2],
-          q[3],
-          load_vec3(P.log_scales, index, P.count),
-          load_wide(logits)};
+  return {load_vec3(P.means, index, P.count), q[0], q[1], q[2], q[3], load_vec3(P.log_scales, index, P.count),
+      load_wide(logits)};
 }
 
 template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<F>& offset, F& inverse_distance) {
@@ -68,8 +63,8 @@ inline void load_bands(const Parameters& P, const int64_t index[kWide], int band
   }
 }
 
-inline Vec3<wide> sh_color(const Frame& frame, const Parameters& P, const int64_t index[kWide],
-                           const Vec3<wide>& mean) {
+inline Vec3<wide> sh_color(
+    const Frame& frame, const Parameters& P, const int64_t index[kWide], const Vec3<wide>& mean) {
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   alignas(64) float Y[kMaxBands][kWide];
   wide sh[3 * kMaxBands + 3];
@@ -91,8 +86,8 @@ struct Visible {
 // Records of a vector of splats, field by field; there is room for a full one.
 inline void write_records(Record* records, const wide (&field)[12]) {
   const auto four = [&](int f) {
-    store_fours({field[f], field[f + 1], field[f + 2], field[f + 3]},
-                [&](int l, f4 v) { store4(&records[l].mx + f, v); });
+    store_fours(
+        {field[f], field[f + 1], field[f + 2], field[f + 3]}, [&](int l, f4 v) { store4(&records[l].mx + f, v); });
   };
   four(0);
   four(4);
@@ -107,8 +102,8 @@ inline widei ceiling(wide x) {
 }
 
 // One vector of Gaussians.
-inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii,
-                          Visible& visible) {
+inline void project_lanes(
+    const Frame& frame, const Parameters& P, int64_t first, int lanes, int32_t* radii, Visible& visible) {
   const Camera& cam = frame.camera;
   int64_t index[kWide];
   for (int l = 0; l < kWide; ++l) index[l] = first + (l < lanes ? l : 0);
@@ -138,7 +133,7 @@ inline void project_lanes(const Frame& frame, const Parameters& P, int64_t first
   const TileBoxes boxes = tile_boxes(frame, p.mx, p.my, rx, ry, ok);
   const Vec3<wide> color = sh_color(frame, P, index, g.mean);
   write_records(records, {p.mx, p.my, A, B, C, lo, color.x, color.y, color.z, p.t.z,
-                          from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
+                             from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
   alignas(64) int32_t box[4][kWide], tiles[2][kWide] = {}, radius[2][kWide], keys[kWide];
   store_widei(box[0], boxes.x0);
   store_widei(box[1], boxes.x1);

@@ -18,8 +18,8 @@ inline Vec3<wide> color_gradient(const Frame& frame, const int64_t index[kWide],
 }
 
 // v_e of (18).
-inline Vec3<wide> sh_backward(const Parameters& P, const int64_t index[kWide], int degree, const Vec3<wide>& d,
-                              const Vec3<wide>& v_color) {
+inline Vec3<wide> sh_backward(
+    const Parameters& P, const int64_t index[kWide], int degree, const Vec3<wide>& d, const Vec3<wide>& v_color) {
   const int bands = (degree + 1) * (degree + 1) - 1;
   wide sh[3 * kMaxBands + 3];
   Vec3<wide> Y[kMaxBands];
@@ -33,7 +33,7 @@ inline Vec3<wide> sh_backward(const Parameters& P, const int64_t index[kWide], i
 
 // v_sh,k of (18) of a vector of Gaussians whose dLoss/d(sh0) is written.
 inline void write_bands_gradient(const Frame& frame, const Parameters& P, const ParameterGradients& G,
-                                 const int64_t index[kWide], const Vec3<wide>& mean) {
+    const int64_t index[kWide], const Vec3<wide>& mean) {
   const int bands = (frame.sh_degree + 1) * (frame.sh_degree + 1) - 1;
   alignas(64) float Y[kMaxBands][kWide];
   view_basis(frame.camera, mean, frame.sh_degree, Y);
@@ -62,7 +62,7 @@ inline bool sum_rows(const Frame& frame, const Cover* cover, float out[kRow]) {
 
 // A full vector, always: a compiler that knew how many lanes count might round the last vector otherwise.
 inline void project_backward_lanes(const Frame& frame, const Parameters& P, const ParameterGradients& G,
-                                   const int64_t index[kWide], const float sums[kWide][kRow]) {
+    const int64_t index[kWide], const float sums[kWide][kRow]) {
   const Camera& cam = frame.camera;
   wide field[kRow];
   for (int h = 0; h < kRow; h += 8) load_eights([&](int l) { return load8(sums[l] + h); }, field + h);
@@ -72,15 +72,8 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   // Blending measures u and v in units of sqrt(kHalfLog2E).
   constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
   const wide su = field[kSu] * length, sv = field[kSv] * length;
-  const SplatGradient<wide> v = {su,
-                                 sv,
-                                 field[kSuu] * square,
-                                 field[kSuv] * square,
-                                 field[kSvv] * square,
-                                 field[kS],
-                                 L.A * su,
-                                 L.B * su + L.C * sv,
-                                 field[kWz]};
+  const SplatGradient<wide> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
+      L.A * su, L.B * su + L.C * sv, field[kWz]};
   Splat3D<wide> out = project_backward(cam, p, L, v);
 
   wide inv;

@@ -124,7 +124,7 @@ inline f16 sqrt_near(f16 a) { return joined(sqrt_near(low_half(a)), sqrt_near(hi
 inline f16 max(f16 a, f16 b) { return joined(max(low_half(a), low_half(b)), max(high_half(a), high_half(b))); }
 inline i16 shift_left(i16 a, i16 n) {
   return (i16)joined((f8)shift_left((i8)low_half((f16)a), (i8)low_half((f16)n)),
-                     (f8)shift_left((i8)high_half((f16)a), (i8)high_half((f16)n)));
+      (f8)shift_left((i8)high_half((f16)a), (i8)high_half((f16)n)));
 }
 inline f16 min(f16 a, f16 b) { return joined(min(low_half(a), low_half(b)), min(high_half(a), high_half(b))); }
 inline i16 max(i16 a, i16 b) { return a > b ? a : b; }
@@ -196,8 +196,8 @@ template <> inline f16 exp2<f16>(f16 x) {
             high = *reinterpret_cast<const i16u*>(kExpTable.of + 16);
   const f16 magic = splat<f16>(393216.f);  // 1.5 * 2^18
   const f16 shifted = x + magic, f = x - (shifted - magic);
-  const f16 power = from_bits((i16)_mm512_permutex2var_epi32((__m512i)low, (__m512i)bits(shifted), (__m512i)high) +
-                              (bits(shifted) << 18));
+  const f16 power = from_bits(
+      (i16)_mm512_permutex2var_epi32((__m512i)low, (__m512i)bits(shifted), (__m512i)high) + (bits(shifted) << 18));
   return power + power * (f * (f * splat<f16>(2.402265e-01f) + splat<f16>(6.9315733e-01f)));
 }
 #endif

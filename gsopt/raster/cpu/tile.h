@@ -24,7 +24,7 @@ struct TileGeometry {
 };
 inline TileGeometry tile_geometry(const Frame& frame, int tile) {
   return {static_cast<float>(tile % frame.tiles_x * kTile + kTile / 2),
-          static_cast<float>(tile / frame.tiles_x * kTile + kTile / 2)};
+      static_cast<float>(tile / frame.tiles_x * kTile + kTile / 2)};
 }
 
 // Records lie anywhere in memory: those of entries [begin, end) of the frame are asked for long before they are needed,
@@ -130,8 +130,8 @@ inline Rgb load_rgb(const float* p, int n) {
   }
   const f4 low = load4(p), mid = load4(p + 4), high = load4(p + 8);
   return {__builtin_shufflevector(__builtin_shufflevector(low, mid, 0, 3, 6, 6), high, 0, 1, 2, 5),
-          __builtin_shufflevector(__builtin_shufflevector(low, mid, 1, 4, 7, 7), high, 0, 1, 2, 6),
-          __builtin_shufflevector(__builtin_shufflevector(low, mid, 2, 5, 5, 5), high, 0, 1, 4, 7)};
+      __builtin_shufflevector(__builtin_shufflevector(low, mid, 1, 4, 7, 7), high, 0, 1, 2, 6),
+      __builtin_shufflevector(__builtin_shufflevector(low, mid, 2, 5, 5, 5), high, 0, 1, 4, 7)};
 }
 inline void store_rgb(float* p, const Rgb& c, int n) {
   if (n < 4) {

@@ -25,7 +25,7 @@ inline TileBoxes tile_boxes(const Frame& frame, wide mx, wide my, wide rx, wide 
     return to_int(clamp(tile, splat<wide>(0.f), splat<wide>(static_cast<float>(tiles)))) & seen;
   };
   return {within((mx - rx) * inv, frame.tiles_x), within((mx + rx) * inv + 1.f, frame.tiles_x),
-          within((my - ry) * inv, frame.tiles_y), within((my + ry) * inv + 1.f, frame.tiles_y)};
+      within((my - ry) * inv, frame.tiles_y), within((my + ry) * inv + 1.f, frame.tiles_y)};
 }
 
 // Where the ellipse ends in the kTile rows from `top` on, in x as the center has it; `mx` is the center in the image.
@@ -104,7 +104,7 @@ template <class Visit> inline void for_each_tile(const Frame& frame, const Cover
 inline Cover cover_of(const Frame& frame, uint32_t id, const TileBox& box, uint64_t tiles) {
   if (frame.skips.tiles && box.masked())
     return {tiles, static_cast<uint16_t>(box.x0), static_cast<uint16_t>(box.y0),
-            static_cast<uint32_t>(__builtin_popcountll(tiles))};
+        static_cast<uint32_t>(__builtin_popcountll(tiles))};
   Cover cover = {0, kAskRecord, kAskRecord, 0};
   uint32_t n = 0;
   for_each_tile(frame, cover, id, [&](int) { ++n; });
