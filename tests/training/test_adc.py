@@ -144,6 +144,16 @@ def test_the_transparent_go_and_the_huge_go_once_opacities_were_reset() -> None:
     assert torch.equal(controlled(late).refine(60, late).gaussians.means, gaussians.means[[0]])
 
 
+def test_halves_that_are_huge_or_transparent_do_not_stay() -> None:
+    huge = 2 * SPLIT_SHRINK * CONFIG.prune_scale3d * EXTENT
+    gaussians = scene([LARGE, huge, LARGE], [0.5, 0.5, 0.5 * CONFIG.prune_opacity])
+    for step, rows in ((10, 4), (60, 2)):  # the huge stay until opacities were reset
+        model = OptimizedGaussians.start(gaussians)
+        density = controlled(model)
+        density.after_backward(5, pulled(3, torch.arange(3)), seen(3), 10, 10)
+        assert len(density.refine(step, model)) == rows
+
+
 def test_a_reset_caps_opacities_and_forgets_their_moments() -> None:
     model = OptimizedGaussians.start(scene([SMALL] * 3, [0.9, 0.5, 0.008]))
     for moments in (model.exp_avg, model.exp_avg_sq):

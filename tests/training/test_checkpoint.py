@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -81,3 +83,20 @@ def test_a_folder_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> No
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="Free some space"):
         save_checkpoint(tmp_path / "file", 1, TENSORS, {})
+
+
+@pytest.mark.parametrize("broken", ["fsync", "replace"])
+def test_a_disk_that_refuses_leaves_the_old_checkpoints_and_no_temporary(
+    broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for step in (1, 2):
+        save_checkpoint(tmp_path, step, TENSORS, {"step": step})
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(os, broken, refuse)
+    for step in (2, 3):
+        with pytest.raises(InputError, match="No space left on device"):
+            save_checkpoint(tmp_path, step, {"a": torch.ones(9)}, {})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

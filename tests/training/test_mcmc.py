@@ -72,6 +72,30 @@ def test_the_dead_are_moved_onto_the_living_with_fresh_moments() -> None:
         assert len(refined.gaussians.log_scales[twin].unique(dim=0)) == 1
 
 
+def test_the_dead_are_never_sources_however_many_and_barely_dead() -> None:
+    gaussians = cloud(400, seed=1)
+    opacities = torch.full((400,), 0.99 * CONFIG.prune_opacity)
+    opacities[:20] = 2 * CONFIG.prune_opacity
+    model = OptimizedGaussians.start(replace(gaussians, logit_opacities=torch.logit(opacities)))
+    refined = controlled(replace(CONFIG, max_gaussians=400)).refine(10, model)
+    onto_living = (refined.gaussians.means[20:, None] == gaussians.means[:20]).all(-1).any(dim=1)
+    assert bool(onto_living.all())
+
+
+def test_sources_forget_their_moments_and_the_others_keep_them() -> None:
+    gaussians = cloud(40, seed=1)
+    opacities = torch.full((40,), 1e-4)
+    opacities[:20] = 0.5
+    model = OptimizedGaussians.start(replace(gaussians, logit_opacities=torch.logit(opacities)))
+    for moments in (model.exp_avg, model.exp_avg_sq):
+        moments.means.fill_(1.0)
+    refined = controlled(replace(CONFIG, max_gaussians=40)).refine(10, model)
+    sources = (refined.gaussians.means[20:, None] == gaussians.means[:20]).all(-1).any(dim=0)
+    assert 0 < int(sources.sum()) < 20
+    for moments in (refined.exp_avg, refined.exp_avg_sq):
+        assert torch.equal(moments.means[:20].any(dim=1), ~sources)
+
+
 @pytest.mark.parametrize(("count", "budget", "after"), [(40, 60, 42), (59, 60, 60), (60, 60, 60)])
 def test_growth_is_five_per_cent_up_to_the_budget(count: int, budget: int, after: int) -> None:
     model = OptimizedGaussians.start(cloud(count, seed=2))

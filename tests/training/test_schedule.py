@@ -120,6 +120,14 @@ def test_a_flat_loss_ends_a_run_and_a_falling_one_never_does() -> None:
     assert not any(falling.update(0.99 ** (step / 10)) for step in range(5000))
 
 
+def test_a_noisy_plateau_is_flat() -> None:
+    flat = Flatness.of(views=100)
+    losses = [1.0 + 0.05 * (window % 2) for window in range(20) for _ in range(flat.window)]
+    assert next(step for step, loss in enumerate(losses, 1) if flat.update(loss)) == flat.window * (
+        1 + Flatness.PATIENCE
+    )
+
+
 def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
     config = TrainConfig(iterations=1000)
     run = made(config)

@@ -136,6 +136,15 @@ def test_a_band_is_drawn_where_the_residual_follows_it_and_not_where_it_is_noise
         assert bands.ratio() == 0
 
 
+def test_a_resumed_decision_about_bands_is_the_one_of_the_run_that_never_stopped() -> None:
+    bands, resumed = residuals(8, dependent=True), Bands(every=8, highest=3)
+    resumed.restore(bands.tensors())
+    assert resumed.ratio() == bands.ratio() > Bands.LEAST_RATIO
+    for one in (bands, resumed):
+        one.decide(8)
+    assert resumed.degree == bands.degree == 1
+
+
 def test_one_view_decides_nothing() -> None:
     assert residuals(1, dependent=True).ratio() == 0
 
