@@ -54,3 +54,11 @@ class MissingDependency(GsoptError):
 def shortened(value: object) -> str:
     """A value of a file as messages repeat it: at most 80 characters, however long or deeply nested it is."""
     return _SHORT.repr(value)[:80]
+
+
+def refused(error: OSError) -> str:
+    """The message for what the operating system refused; long names are shortened."""
+    name = "" if error.filename is None else f", got {shortened(str(error.filename))}"
+    return (
+        f"The system refused a file or connection: {error.strerror or error}{name}. Check names, space and permissions."
+    )

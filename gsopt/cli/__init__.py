@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import os
 import sys
 from collections.abc import Sequence
 
 from gsopt._version import __version__
-from gsopt.errors import GsoptError, UsageError
+from gsopt.cli.standard_streams import outlast_readers
+from gsopt.errors import GsoptError, InputError, UsageError, refused
 
 VERBS = {
     "sfm": "find the poses of photos or a video",
@@ -26,23 +26,41 @@ VERBS = {
 }
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+LOGGED = ("train", "demo")
+"""Verbs whose lines stand in log.txt too: no output is lost."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code: 0, a GsoptError's `exit_code`, or 130 when interrupted."""
+    """Run one verb and return the exit code: 0, a GsoptError's `exit_code`, or 130 when interrupted.
+
+    Output that nobody can read does not stop the verb: it finishes, and the exit code is then 1, or 3 for a full disk.
+    """
+    beneath = outlast_readers()
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        code = answer(list(sys.argv[1:] if argv is None else argv))
-        sys.stdout.flush()  # here, where a closed pipe can be caught
-        return code
+        code = answer(arguments)
+        sys.stdout.flush()
+        logged = arguments[0] in LOGGED and not {"-h", "--help"} & set(arguments)
+        if beneath is None or beneath.failure is None or logged:
+            return code
+        return code or lost_output(beneath.failure)
     except GsoptError as error:
         print(f"gsopt: {error}", file=sys.stderr)
         return error.exit_code
+    except OSError as error:
+        print(f"gsopt: {refused(error)}", file=sys.stderr)
+        return InputError.exit_code
     except KeyboardInterrupt:
         print("gsopt: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # `gsopt ... | head`: the reader has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def lost_output(failure: OSError) -> int:
+    """Returns the exit code of a verb whose work is done but whose output was lost; `gsopt ... | head` is no error."""
+    if isinstance(failure, BrokenPipeError):
         return 1
+    print(f"gsopt: stdout: {refused(failure)}", file=sys.stderr)
+    return InputError.exit_code
 
 
 def answer(arguments: Sequence[str]) -> int:
@@ -95,5 +113,6 @@ def usage() -> str:
         "3D Gaussian Splatting from few images.\n\n"
         f"verbs:\n{verbs}\n\n"
         "`gsopt VERB --help` explains a verb's flags; `gsopt --version` prints the version.\n"
-        "exit codes: 0 done, 2 wrong flag or missing package, 3 unusable input, 4 numerical failure, 130 interrupted."
+        "exit codes: 0 done, 1 done but output lost, 2 wrong flag or missing package, 3 unusable input, "
+        "4 numerical failure, 130 interrupted."
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
-from gsopt.errors import GsoptError, InputError, UsageError, shortened
+from gsopt.errors import GsoptError, InputError, UsageError, refused, shortened
 from gsopt.events import EventWriter, to_json, write_atomic
 
 Listener = Callable[[Mapping[str, Any]], None]
@@ -124,12 +124,16 @@ def describe(error: BaseException) -> str:
     """One line for people: our own errors speak for themselves."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; the last checkpoint can be resumed with --resume"
+    if isinstance(error, OSError):
+        return refused(error)
     return str(error) if isinstance(error, GsoptError) else f"{type(error).__name__}: {error}"
 
 
 def exit_code(error: BaseException) -> int:
     if isinstance(error, KeyboardInterrupt):
         return 130
+    if isinstance(error, OSError):
+        return InputError.exit_code
     return error.exit_code if isinstance(error, GsoptError) else 1
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
@@ -269,6 +270,19 @@ def test_a_failing_evaluation_is_the_last_event(data: Path, tmp_path: Path, monk
     assert "vanished" in capsys.readouterr().err
     assert kinds(tmp_path / "run")[-1] == "error"
     assert (tmp_path / "run" / "splat.ply").is_file()
+
+
+def test_a_run_outlives_the_reader_of_its_output(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "gsopt", "train", *small(data, run)], stdout=writer, stderr=writer, check=False
+    )
+    os.close(writer)
+    assert done.returncode == 0
+    assert kinds(run)[-1] == "done"
+    assert "step 20/20" in (run / "log.txt").read_text()
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (3599, "59:59"), (7322, "2:02:02")])
