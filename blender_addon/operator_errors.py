@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from . import progress_timer
-from .core.errors import GsoptError
+from .core.errors import GsoptError, printable
 
 LONG = 24 * 3600.0
 """Seconds that an operator waits at most."""
@@ -24,8 +24,8 @@ class ReportingOperator:
         try:
             said = self.do(context)  # type: ignore[attr-defined]
         except (GsoptError, OSError) as error:
-            context.scene.gsopt.message = str(error)
-            self.report({"ERROR"}, str(error))  # type: ignore[attr-defined]
+            context.scene.gsopt.message = printable(str(error))
+            self.report({"ERROR"}, context.scene.gsopt.message)  # type: ignore[attr-defined]
             return {"CANCELLED"}
         if isinstance(said, str):
             self.report({"INFO"}, said)  # type: ignore[attr-defined]

@@ -6,6 +6,7 @@ Poses are world_from_cam with Blender's and OpenGL's axes: x right, y up, lookin
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from . import colmap
 from .errors import InputError
-from .files import read_json
+from .files import is_text, read_json
 
 LARGEST_FILE = 64 << 20
 MOST_VIEWS = 20_000
@@ -85,19 +86,23 @@ def view_of(folder: Path, values: dict[str, Any], split: str) -> View:
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError("transform_matrix is no 4x4 matrix")
     width, height = int(values.get("w", 0)), int(values.get("h", 0))
+    if not 0 <= width < 2**31 or not 0 <= height < 2**31 or not is_text(values["file_path"]):
+        raise ValueError("w, h or file_path")
     focal = float(values["fl_x"]) if "fl_x" in values else 0.0
     angle = 2 * math.atan(0.5 * width / focal) if focal > 0 and width > 0 else float(values["camera_angle_x"])
     if not 0 < angle < math.pi:
         raise ValueError(f"a field of view of {angle} radians")
     center = (float(values["cx"]), float(values["cy"])) if {"cx", "cy", "w", "h"} <= set(values) else None
-    image = find_image(folder, str(values["file_path"]))
+    if center is not None and not all(map(math.isfinite, center)):
+        raise ValueError("cx or cy")
+    image = find_image(folder, values["file_path"])
     return View(image.stem, image, split, pose, width, height, angle, center)
 
 
 def find_image(folder: Path, name: str) -> Path:
     """The picture of a frame, whose suffix NeRF-synthetic leaves out; the path as it stands where there is none."""
     path = folder / name.replace("\\", "/")
-    return next((p for p in (path.with_name(path.name + suffix) for suffix in SUFFIXES) if p.is_file()), path)
+    return next((p for p in (path.with_name(path.name + suffix) for suffix in SUFFIXES) if os.path.isfile(p)), path)
 
 
 def from_colmap(data: Path, sparse: Path) -> list[View]:

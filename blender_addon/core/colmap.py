@@ -64,7 +64,7 @@ def read_cameras(data: bytes) -> dict[int, tuple[int, int, float, tuple[float, f
         values = struct.unpack_from(f"<{PARAMETERS[model]}d", data, at + 24)
         at += 24 + 8 * PARAMETERS[model]
         center = values[1:3] if model in SHARED_FOCAL else values[2:4]
-        if not values[0] > 0 or not 0 < width < 2**31 or not 0 < height < 2**31:
+        if not values[0] > 0 or not np.isfinite(values).all() or not 0 < width < 2**31 or not 0 < height < 2**31:
             raise ValueError(f"camera {number} has no usable lens")
         found[number] = int(width), int(height), values[0], (center[0], center[1])
     return found

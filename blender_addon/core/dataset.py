@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from .files import read_json
 
 PARTIAL = ".partial-"
 RECORD = "object.json"
+LARGEST_ENTRY = 1e30
+"""Bound of a matrix entry; Blender's matrices are float32."""
 
 
 def pictures(out: Path) -> int:
@@ -49,7 +50,7 @@ def failure(out: Path) -> str:
         with open(out / "failures.json", "rb") as file:
             lost = json.loads(file.read(1 << 20))
         return str(lost[0]["reason"])[:500] if lost else ""
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return ""
 
 
@@ -60,10 +61,13 @@ def scene_from_dataset(data: Path) -> NDArray[np.float64] | None:
     matrix: Any = read_json(data / RECORD).get("normalized_from_mesh")
     try:
         forward = np.array(matrix, np.float64)
-        if forward.shape != (4, 4) or not all(math.isfinite(value) for value in forward.flat):
+        if forward.shape != (4, 4) or not (np.abs(forward) < LARGEST_ENTRY).all():
             raise ValueError("it is no 4x4 matrix")
-        return np.linalg.inv(forward).astype(np.float64)
-    except (ValueError, TypeError, np.linalg.LinAlgError) as error:
+        back = np.linalg.inv(forward).astype(np.float64)
+        if not (np.abs(back) < LARGEST_ENTRY).all():
+            raise ValueError("it has no inverse")
+        return back
+    except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError) as error:
         raise InputError(
             f"`normalized_from_mesh` of {data / RECORD} cannot be used: {error}. Render it again."
         ) from error

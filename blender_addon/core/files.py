@@ -35,10 +35,24 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             temporary.unlink(missing_ok=True)
 
 
+def encoded(value: Any) -> bytes:
+    """A value as JSON. InputError for what no JSON file holds: Infinity, NaN, lone surrogates, endless nesting."""
+    try:
+        return (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"No JSON file can hold this: {error}. Remove that number, character or depth.") from error
+
+
 def write_json(path: Path, value: Any) -> None:
     """A whole JSON file or the one that was there before."""
+    data = encoded(value)
     with replacing(path) as file:
-        file.write((json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+        file.write(data)
+
+
+def is_text(value: Any) -> bool:
+    """True for text that can be a path: no NUL, no lone surrogate."""
+    return isinstance(value, str) and "\0" not in value and not any("\ud800" <= c <= "\udfff" for c in value)
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:

@@ -14,17 +14,20 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from .errors import InputError, UsageError
-from .files import read_json, write_json
+from .files import is_text, read_json, write_json
 
-VERSION = 1
+VERSION = 2
 RECORD, OUTPUT = "job.json", "output.txt"
 FOREIGN = ("PYTHON", "BLENDER_", "VIRTUAL_ENV", "__PYVENV", "CONDA_PYTHON")
 """Variables of Blender's own Python that would lead another Python astray."""
 LOADER = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES")
 TAIL = 1 << 16
 """Bytes at the end of an output that are read."""
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+"""Linux: another text after every start of the machine."""
 
 _children: dict[int, subprocess.Popen[bytes]] = {}
 
@@ -44,6 +47,8 @@ class Job:
     """The file or folder that it shall make."""
     total: int = 0
     """Number of items it makes one by one, such as images; 0 when unknown."""
+    identity: str = ""
+    """Id, boot and start of its process, as `identity` returns them."""
 
 
 def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
@@ -82,7 +87,8 @@ def start(kind: str, arguments: Sequence[str], folder: Path, product: Path | Non
                 f"Cannot start {arguments[0]}: {reason}. Set the interpreter in the preferences."
             ) from error
     _children[process.pid] = process
-    job = Job(kind, str(folder), tuple(arguments), process.pid, time.time(), str(product or ""), total)
+    pid, born = process.pid, identity(process.pid)
+    job = Job(kind, str(folder), tuple(arguments), pid, time.time(), str(product or ""), total, born)
     try:
         write_json(folder / RECORD, {"version": VERSION, **asdict(job)})
     except InputError:
@@ -97,19 +103,32 @@ def read_job(folder: Path) -> Job:
     if values.pop("version", None) != VERSION:
         raise InputError(f"{folder / RECORD} is of another version of the extension. Start the work again.")
     try:
-        values["arguments"] = tuple(str(word) for word in values["arguments"])
-        job = Job(**values)
-        return job if isinstance(job.pid, int) and isinstance(job.started, (int, float)) else Job(**{})
-    except (TypeError, KeyError) as error:
+        values |= {"folder": str(folder), "arguments": require_record(values)}
+        return Job(**values)
+    except (TypeError, KeyError, ValueError) as error:
         raise InputError(f"{folder / RECORD} is damaged: {error}. Start the work again.") from error
 
 
+def require_record(values: dict[str, Any]) -> tuple[str, ...]:
+    """The argument list of a record. ValueError, KeyError or TypeError for values that no job has."""
+    texts, numbers = ("kind", "folder", "product", "identity"), ("pid", "total")
+    if not isinstance(values["arguments"], list) or not values["arguments"]:
+        raise ValueError("`arguments` must be a list of words")
+    if not all(map(is_text, [*values["arguments"], *(values[name] for name in texts)])):
+        raise ValueError(f"{', '.join(texts)} and the words of `arguments` must be text")
+    if any(type(values[name]) is not int or not 0 <= values[name] < 2**31 for name in numbers):
+        raise ValueError("pid and total must be whole numbers below 2^31")
+    if not isinstance(values["started"], (int, float)):
+        raise ValueError("started must be a number")
+    return tuple(values["arguments"])
+
+
 def alive(job: Job) -> bool:
-    """True while it runs; another program that got the same process id does not count."""
-    child = _children.get(job.pid)
-    if child is not None:
-        return child.poll() is None
-    return process_alive(job.pid, job.started)
+    """True while it runs; another program does not count, whatever process id a record names."""
+    child, found = _children.get(job.pid), identity(job.pid)
+    if job.identity != found or (child is None and not found):
+        return False
+    return process_alive(job.pid, time.time())
 
 
 def process_alive(pid: int, started_before: float) -> bool:
@@ -131,11 +150,28 @@ def process_alive(pid: int, started_before: float) -> bool:
     return born is None or born <= started_before + 2.0
 
 
+def identity(pid: int) -> str:
+    """Id, boot and start of a process, which no file from elsewhere can know; empty where it is gone or unknown."""
+    if sys.platform == "win32":
+        return _birth_on_windows(pid)
+    with contextlib.suppress(OSError, IndexError):
+        if BOOT.is_file():
+            return f"{pid} {BOOT.read_text(encoding='ascii').strip()} {proc_fields(pid)[19]}"
+        call, environment = ["/bin/ps", "-o", "pid=,lstart=", "-p", str(pid)], {"LC_ALL": "C", "TZ": "UTC"}
+        return subprocess.run(call, capture_output=True, text=True, env=environment, check=False).stdout.strip()
+    return ""
+
+
+def proc_fields(pid: int) -> list[str]:
+    """Fields of /proc/PID/stat from the state on."""
+    return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+
+
 def birth(pid: int) -> float | None:
     """Returns when a process began, seconds since 1970; unknown is None, infinity stands for one that has ended
     and only waits to be noticed by its parent."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        fields = proc_fields(pid)
         uptime = float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
         if fields[0] in "ZX":
             return float("inf")
@@ -156,6 +192,17 @@ def _alive_on_windows(pid: int) -> bool:
     kernel.GetExitCodeProcess(handle, ctypes.byref(code))
     kernel.CloseHandle(handle)
     return code.value == still_active
+
+
+def _birth_on_windows(pid: int) -> str:
+    """Id and start of a process, 100 ns since 1601; empty where it is gone."""
+    import ctypes
+
+    kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+    handle, times = kernel.OpenProcess(0x1000, False, pid), [ctypes.c_ulonglong() for _ in range(4)]
+    known = handle and kernel.GetProcessTimes(handle, *map(ctypes.byref, times))
+    kernel.CloseHandle(handle)
+    return f"{pid} {times[0].value}" if known else ""
 
 
 def end(job: Job, force: bool = False) -> None:

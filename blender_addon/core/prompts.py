@@ -5,6 +5,7 @@ Everything beside the prompts (notes, domain, how they were made, images) is kep
 
 from __future__ import annotations
 
+import os
 import re
 import unicodedata
 from dataclasses import asdict, dataclass, field, fields
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputError
-from .files import read_json, write_json
+from .files import encoded, read_json, write_json
 
 VERSION = 1
 LARGEST_FILE = 1 << 20
@@ -55,7 +56,8 @@ class Prompt:
             raise InputError(
                 f"A prompt has view {self.view!r:.40} and polarity {self.polarity!r:.40}. Pick known ones."
             )
-        if not isinstance(self.source, str) or not SOURCE.fullmatch(self.source):
+        require_text(self.source, "source", LONGEST_TEXT)
+        if not SOURCE.fullmatch(self.source):
             raise InputError(f"`source` of a prompt must be user, template or llm:MODEL; got {self.source!r:.40}.")
 
 
@@ -69,19 +71,19 @@ class Document:
 
     def accepted(self, folder: Path) -> list[Path]:
         """The pictures that were accepted and lie where a file in `folder` says."""
-        return [path for path, accepted in self._pictures(folder) if accepted and path.is_file()]
+        return [path for path, accepted in self._pictures(folder) if accepted and os.path.isfile(path)]
 
     def beside(self, folder: Path) -> Document:
         """As a file in `folder` may say it: pictures are named by their place beside it, and only those there are."""
-        if all(path.is_file() for path, _ in self._pictures(folder)):
+        if all(os.path.isfile(path) for path, _ in self._pictures(folder)):
             return self
         return Document(self.prompts, {key: value for key, value in self.rest.items() if key != "images"})
 
     def _pictures(self, folder: Path) -> list[tuple[Path, bool]]:
         listed = self.rest.get("images")
         rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
-        names = [(row["file"], row.get("accepted") is True) for row in rows if FILE.fullmatch(str(row.get("file")))]
-        return [(folder / name, accepted) for name, accepted in names]
+        named = [row for row in rows if isinstance(row.get("file"), str) and FILE.fullmatch(row["file"])]
+        return [(folder / row["file"], row.get("accepted") is True) for row in named]
 
 
 def read_prompts(path: Path) -> Document:
@@ -109,6 +111,7 @@ def parse(document: dict[str, Any]) -> Document:
         except InputError as error:
             raise InputError(f"Prompt {number}: {error}") from error
     rest = {key: value for key, value in document.items() if key not in ("version", "prompts")}
+    encoded(rest)
     return Document(tuple(prompts), rest)
 
 

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from . import job as jobs
-from .errors import InputError
+from .errors import InputError, printable
+from .files import is_text
 
 PROTOCOL = 1
 PIECE = 1 << 18
@@ -26,6 +27,8 @@ SILENCE = 900.0
 """Seconds without a word after which a run counts as ended where its process is not known."""
 FINAL = ("done", "stopped", "error")
 MOST_MESSAGES = 50
+STOP_FLAGS = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Neither makes what a symlink names nor waits for the reader of a pipe."""
 LONGEST = 500
 
 
@@ -57,7 +60,7 @@ class Run:
         return self.messages[-1] if self.messages and self.status in ("error", "killed", "unreadable") else ""
 
     def say(self, message: object) -> None:
-        text = " ".join(str(message).split())[:LONGEST]
+        text = printable(" ".join(str(message).split())[:LONGEST])
         if not self.messages or self.messages[-1] != text:
             self.messages = [*self.messages[1 - MOST_MESSAGES :], text]
 
@@ -126,7 +129,7 @@ class Follower:
         if kind == "preview":
             run.preview = inside(run.path, event.get("path")) or run.preview
         if kind in ("warning", "guidance", "error"):
-            run.say(event.get("message", ""))
+            run.say(event["message"] if isinstance(event.get("message"), str) else "")
         if kind in FINAL:
             run.status, run.eta = str(kind), None
 
@@ -170,7 +173,7 @@ def events_in(lines: list[bytes], path: Path) -> Iterator[dict[str, Any]]:
             event = json.loads(line)
         except (ValueError, RecursionError):
             continue
-        if not isinstance(event, dict) or not isinstance(event.get("seq"), int):
+        if not isinstance(event, dict) or not all(isinstance(event.get(name), int) for name in ("seq", "v")):
             continue
         version = event.get("v")
         if version != PROTOCOL:
@@ -194,7 +197,7 @@ def number(value: Any) -> float | None:
 
 def inside(run: Path, name: Any) -> str:
     """An announced file of the run, absolute; empty when it is none or points out of the directory."""
-    if not isinstance(name, str) or not name:
+    if not name or not is_text(name):
         return ""
     try:
         path = (run / name).resolve()
@@ -222,7 +225,7 @@ def length(run: Path) -> int:
 def ask_to_stop(run: Path) -> None:
     """The run finishes its step, saves and exits. InputError where the request cannot be written."""
     try:
-        (run / "stop").touch()
+        os.close(os.open(run / "stop", STOP_FLAGS, 0o666))
     except OSError as error:
         raise InputError(f"Cannot write {run / 'stop'}: {error.strerror}. End its process instead.") from error
 

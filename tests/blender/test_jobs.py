@@ -7,19 +7,15 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from job_records import HOSTILE_RECORDS, record_of, wait
 
 from blender_addon.core import job
 from blender_addon.core.errors import InputError, UsageError
-
-
-def wait(running: job.Job) -> None:
-    until = time.monotonic() + 30
-    while job.alive(running):
-        assert time.monotonic() < until
-        time.sleep(0.02)
 
 
 def test_blenders_python_variables_do_not_reach_another_python() -> None:
@@ -78,6 +74,48 @@ def test_a_damaged_record_is_refused(tmp_path: Path, record: str) -> None:
     (tmp_path / job.RECORD).write_text(record)
     with pytest.raises(InputError, match=r"job\.json"):
         job.read_job(tmp_path)
+
+
+@pytest.mark.parametrize("changed", HOSTILE_RECORDS, ids=lambda changed: f"{changed!a:.40}")
+def test_a_hostile_record_is_refused(tmp_path: Path, changed: dict[str, Any]) -> None:
+    record_of(tmp_path, changed)
+    with pytest.raises(InputError, match=r"job\.json is damaged"):
+        job.read_job(tmp_path)
+
+
+def test_a_record_speaks_of_its_own_folder_only(tmp_path: Path) -> None:
+    (tmp_path / "private").mkdir()
+    (tmp_path / "private" / job.OUTPUT).write_text("a secret")
+    record_of(tmp_path / "a", {"folder": str(tmp_path / "private")})
+    assert job.last_words(job.read_job(tmp_path / "a")) == ""
+
+
+def test_a_record_that_names_a_foreign_process_neither_lives_nor_ends_it(tmp_path: Path) -> None:
+    """A downloaded job.json may name any process id; only what was started as this job counts."""
+    sleep = "import time; time.sleep(60)"
+    foreign = subprocess.Popen([sys.executable, "-c", sleep], start_new_session=True)
+    ours = job.start("train", [sys.executable, "-c", sleep], tmp_path / "ours")
+    try:
+        for pid in (foreign.pid, ours.pid):
+            record_of(tmp_path / f"{pid}", {"pid": pid, "started": time.time()})
+            found = job.read_job(tmp_path / f"{pid}")
+            for record in (found, replace(found, identity="")):
+                assert not job.alive(record)
+                job.end(record, force=True)
+        time.sleep(0.2)
+        assert foreign.poll() is None
+        assert job.alive(ours)
+    finally:
+        foreign.kill()
+        foreign.wait()
+        job.end(ours, force=True)
+        wait(ours)
+
+
+def test_what_no_record_can_hold_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="No JSON file can hold"):
+        job.start("train", [sys.executable, "-c", "", "\udcff"], tmp_path)
+    assert not (tmp_path / job.RECORD).exists()
 
 
 def test_a_job_outlives_a_killed_blender_and_is_found_again(tmp_path: Path) -> None:

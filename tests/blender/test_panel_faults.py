@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from in_panel import event, fails_with
+from job_records import HOSTILE_RECORDS, record_of
 from made_splats import random_splats
 
 from blender_addon.core.ply import write_ply
@@ -138,6 +142,59 @@ def test_poses_are_found_or_the_reason_is_told(panel: Any, tmp_path: Path) -> No
     bpy.ops.gsopt.find_poses()
     assert panel.source == "DATASET"
     assert (Path(panel.dataset) / "transforms.json").is_file()
+
+
+def test_a_downloaded_job_ends_in_a_message(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    from blender_addon import progress_timer
+
+    for number, changed in enumerate(HOSTILE_RECORDS):
+        record_of(tmp_path / str(number), changed)
+        for kind in progress_timer.KINDS:
+            entry, panel.message = getattr(panel, f"job_{kind}"), ""
+            entry.folder, entry.state = str(tmp_path / str(number)), "RUNNING"
+            progress_timer.look(bpy.context.scene)
+            assert entry.state == "FAILED"
+            assert "job.json is damaged" in panel.message
+
+
+def test_stop_ends_no_process_that_a_downloaded_job_names(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    foreign = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+    try:
+        record_of(tmp_path, {"pid": foreign.pid, "started": time.time()})
+        (tmp_path / "events.jsonl").write_text(event("started", pid=foreign.pid, total=9, step=0))
+        panel.run_path = panel.run_job = str(tmp_path)
+        panel.run_status = "running"
+        bpy.ops.gsopt.stop(kill=True)
+        assert panel.run_status == "killed"
+        time.sleep(0.2)
+        assert foreign.poll() is None
+    finally:
+        foreign.kill()
+        foreign.wait()
+
+
+def test_datasets_with_values_beyond_blenders_end_in_a_message(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    huge = 10**400
+    frame = {"file_path": "a", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    lens = {"camera_angle_x": 0.7, "cx": 1, "cy": 1, "w": 2, "h": 2}
+    for changed in ({"w": huge}, {"h": huge}, {"cx": huge}, {"file_path": "\ud800"}):
+        (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [{**frame, **changed}]}))
+        fails_with("Frame 0", bpy.ops.gsopt.import_cameras, directory=str(tmp_path))
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    (tmp_path / "object.json").write_text(json.dumps({"normalized_from_mesh": [[huge] * 4] * 4}))
+    fails_with("normalized_from_mesh", bpy.ops.gsopt.import_cameras, directory=str(tmp_path))
+    (tmp_path / "object.json").unlink()
+    prompts = {"version": 1, "prompts": [{"text": "a"}], "images": [{"file": True}]}
+    (tmp_path / "a.json").write_text(json.dumps(prompts))
+    assert bpy.ops.gsopt.prompts_read(filepath=str(tmp_path / "a.json")) == {"FINISHED"}
+    (tmp_path / "a.json").write_text(json.dumps({**prompts, "notes": float("inf")}))
+    fails_with("No JSON file can hold", bpy.ops.gsopt.prompts_read, filepath=str(tmp_path / "a.json"))
 
 
 def test_work_can_be_canceled_and_is_not_begun_twice(panel: Any, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,6 +36,9 @@ def test_gsopt_reads_the_same_prompts(tmp_path: Path) -> None:
 def test_pictures_are_named_only_where_they_lie(tmp_path: Path) -> None:
     """A copy of the file elsewhere must not name what is not beside it: gsopt refuses that."""
     images = [{"file": "a-images/1.png", "accepted": True}, {"file": "a-images/2.png"}, {"file": "../x"}, 3]
+    images += [{"file": True}, {"file": 1.5}, {"file": ["a.png"]}, {"accepted": True}]
+    longer = Document(PROMPTS, {"images": [{"file": "春" * 100, "accepted": True}]})
+    assert longer.accepted(tmp_path) == []
     document = Document(PROMPTS, {"notes": "oak", "images": images})
     assert document.accepted(tmp_path) == []
     assert document.beside(tmp_path) == Document(PROMPTS, {"notes": "oak"})
@@ -63,6 +67,9 @@ def test_pictures_are_named_only_where_they_lie(tmp_path: Path) -> None:
         [{"text": "a", "view": ["all"]}],
         [{"text": "a", "polarity": "neutral"}],
         [{"text": "a", "source": "llm:"}],
+        [{"text": "a", "source": "llm:\ud800"}],
+        [{"text": "a\udcff"}],
+        [{"text": "a", "rationale": "\ud800"}],
         [{"text": "a", "score": 2}],
         [{"text": "a"}] * 257,
         "a",
@@ -83,6 +90,30 @@ def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, data: bytes) -> 
     (tmp_path / "b.json").write_bytes(b" " * (2 << 20))
     with pytest.raises(InputError, match=r"b\.json.*larger"):
         read_prompts(tmp_path / "b.json")
+
+
+@pytest.mark.parametrize("notes", ["Infinity", "[-Infinity]", "NaN", "1e999", '"\\ud800"', '{"\\udcff": 1}'])
+def test_what_could_not_be_written_back_is_refused_when_it_is_read(tmp_path: Path, notes: str) -> None:
+    (tmp_path / "a.json").write_text(f'{{"version": 1, "prompts": [{{"text": "a chair"}}], "notes": {notes}}}')
+    with pytest.raises(InputError, match=r"a\.json.*No JSON file can hold"):
+        read_prompts(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("depth", [100, 300, 500, 900, 990, 3000, 100_000])
+def test_nesting_that_python_cannot_follow_is_refused(tmp_path: Path, depth: int) -> None:
+    deep = "[" * depth + "]" * depth
+    (tmp_path / "a.json").write_text(f'{{"version": 1, "prompts": [{{"text": "a chair"}}], "notes": {deep}}}')
+    with contextlib.suppress(InputError):
+        write_prompts(tmp_path / "b.json", read_prompts(tmp_path / "a.json"))
+
+
+def test_a_failed_write_leaves_the_file_that_was_there(tmp_path: Path) -> None:
+    write_prompts(tmp_path / "a.json", Document(PROMPTS))
+    for notes in (float("inf"), "\ud800"):
+        with pytest.raises(InputError, match="No JSON file can hold"):
+            write_prompts(tmp_path / "a.json", Document(PROMPTS, {"notes": notes}))
+    assert read_prompts(tmp_path / "a.json") == Document(PROMPTS)
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.json"]
 
 
 EVERYTHING = (

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from blender_addon.core import run_follower
+from blender_addon.core.errors import InputError
 from blender_addon.core.run_follower import PIECE, Follower, earlier_runs, splats_of
 
 
@@ -166,6 +167,38 @@ def test_a_log_that_shrank_is_read_anew(tmp_path: Path) -> None:
     assert follower.poll().step == 80
     (tmp_path / "events.jsonl").write_bytes(STARTED)
     assert follower.poll().step == 0
+
+
+def test_text_that_no_property_holds_is_escaped(tmp_path: Path) -> None:
+    append(tmp_path, STARTED + line("warning", 1, message="a\ud800b") + line("preview", 2, path="\udcff.ply"))
+    append(tmp_path, line("warning", 3, message=["x"]))
+    run = Follower(tmp_path).poll()
+    assert (run.messages, run.preview) == (["a\\ud800b", ""], "")
+
+
+def test_a_request_to_stop_follows_no_symlink(tmp_path: Path) -> None:
+    run, target = tmp_path / "run", tmp_path / "target"
+    run.mkdir()
+    for _ in range(2):  # asked twice, the file is there already
+        run_follower.ask_to_stop(run)
+    assert (run / "stop").is_file()
+    (run / "stop").unlink()
+    (run / "stop").symlink_to(target)
+    with pytest.raises(InputError, match="Cannot write"):
+        run_follower.ask_to_stop(run)
+    assert not target.exists()
+    target.write_text("kept")
+    os.utime(target, (0, 0))
+    with pytest.raises(InputError, match="Cannot write"):
+        run_follower.ask_to_stop(run)
+    assert (target.read_text(), target.stat().st_mtime) == ("kept", 0)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX")
+def test_a_request_to_stop_waits_for_no_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "stop")
+    with pytest.raises(InputError, match="Cannot write"):
+        run_follower.ask_to_stop(tmp_path)
 
 
 def test_the_newest_splats_and_runs_are_found(tmp_path: Path) -> None:

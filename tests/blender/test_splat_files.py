@@ -158,6 +158,8 @@ def test_spz_means_the_same_as_to_gsopt(tmp_path: Path, bands: int) -> None:
         (b"NGSP" + bytes(20), "version 4"),
         (b"no gzip at all", "damaged"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000_000, 3, 12, 0, 0)), "claims"),
+        # 80 MB out of 20 kB: within what may always be claimed are only 64 MB, and 50 times the size of the file.
+        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000, 0, 12, 0, 0)) + bytes(20_000), "claims"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10, 3, 12, 0, 0) + bytes(50)), "ends before"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10, 9, 12, 0, 0)), "SH degree 9"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"GNSP", 3, 10, 0, 12, 0, 0)), "no .spz"),
