@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from gsopt.errors import InputError, UsageError
 
@@ -23,6 +23,10 @@ LARGEST_LOG = 1 << 28
 LARGEST_METRICS = 64 << 20
 """Bytes of metrics.json that are read."""
 LAST = ("done", "stopped", "error")
+WRITTEN_IN_PLACE = ("events.jsonl", "log.txt", "previews", "checkpoints", "guidance", "frames", "renders")
+"""Files that are appended to and folders that are written into; every other file is replaced as a whole."""
+
+_APPEND = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)  # Windows lacks the last one
 
 Report = Callable[[str], None]
 """Takes one line of progress, or a warning, for the user."""
@@ -32,7 +36,7 @@ def write_atomic(path: Path, data: bytes) -> None:
     """Write a whole file or nothing: to a temporary name, flushed to disk, then renamed over `path`."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        with create(temporary) as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -43,6 +47,23 @@ def write_atomic(path: Path, data: bytes) -> None:
         raise InputError(
             f"Cannot write {path}: {error.strerror or error}. Free some space or choose another folder."
         ) from error
+
+
+def create(temporary: Path) -> BinaryIO:
+    """A new file under this name, in the place of whatever a killed writer or a stranger left there."""
+    temporary.unlink(missing_ok=True)
+    return open(temporary, "xb")
+
+
+def refuse_links(run: Path) -> None:
+    """InputError when something in a run directory that is written in place is a symbolic link, one level deep.
+
+    A run directory may come from a stranger: a link would lead the writer to any file of the user.
+    """
+    for path in (run / name for name in WRITTEN_IN_PLACE):
+        for place in (path, *(path.iterdir() if path.is_dir() and not path.is_symlink() else ())):
+            if place.is_symlink():
+                raise InputError(f"{place} must not be a symbolic link, got one. Remove it, or move its target here.")
 
 
 def to_json(value: Any) -> bytes:
@@ -66,19 +87,33 @@ class EventWriter:
         previous, end = read_events(self.path)
         self._seq = previous[-1]["seq"] + 1 if previous else 0
         try:
-            self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            self._fd = os.open(self.path, _APPEND, 0o644)
         except OSError as error:
             raise InputError(f"Cannot write {self.path}: {error.strerror}. Choose another folder.") from error
         _lock(self._fd, self.path)
         if os.fstat(self._fd).st_size > end:
-            os.write(self._fd, b"\n")  # a killed writer left half a line: close it off, readers skip it
+            self._append(b"\n")  # a killed writer left half a line: close it off, readers skip it
 
     def emit(self, kind: str, **fields: Any) -> dict[str, Any]:
         """One line, one write; returns the event."""
         event = {"v": VERSION, "seq": self._seq, "kind": kind, "time": round(time.time(), 3), **fields}
-        os.write(self._fd, _encoded(json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n"))
+        self._append(_encoded(json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n"))
         self._seq += 1
         return event
+
+    def _append(self, line: bytes) -> None:
+        """The whole line, or InputError and nothing of it: what a full disk took of it is cut off again."""
+        size = os.fstat(self._fd).st_size
+        written = 0
+        try:
+            while written < len(line):
+                written += os.write(self._fd, line[written:])
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, size)
+            raise InputError(
+                f"Cannot write {self.path}: {error.strerror or error}. Free some space, then continue with --resume."
+            ) from error
 
     def close(self) -> None:
         os.close(self._fd)

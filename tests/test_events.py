@@ -11,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsopt.errors import InputError, UsageError
-from gsopt.events import LARGEST_LOG, EventWriter, read_events, to_json, write_atomic
+from gsopt.events import (
+    LARGEST_LOG,
+    WRITTEN_IN_PLACE,
+    EventWriter,
+    read_events,
+    refuse_links,
+    to_json,
+    write_atomic,
+)
+from gsopt.formats.files import replacing
 
 FIELDS = st.dictionaries(
     st.sampled_from(["step", "message", "loss", "path"]),
@@ -127,3 +136,71 @@ def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:
     writer.emit("warning", message=name)
     writer.close()
     assert read_events(tmp_path / "events.jsonl")[0][0]["message"] == name
+
+
+@pytest.mark.parametrize("written", [0, 1, 20])
+def test_a_full_disk_leaves_no_half_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
+    """The disk takes the first bytes of a line, then it is full; once there is space the numbering goes on."""
+    writer = EventWriter(tmp_path)
+    writer.emit("started")
+    whole = (tmp_path / "events.jsonl").read_bytes()
+    real, space = os.write, [written]
+
+    def short_write(descriptor: int, data: bytes) -> int:
+        if not space[0]:
+            raise OSError(28, "No space left on device")
+        count = real(descriptor, data[: space[0]])
+        space[0] -= count
+        return count
+
+    monkeypatch.setattr(os, "write", short_write)
+    with pytest.raises(InputError, match=r"No space left on device.*--resume"):
+        writer.emit("progress", step=1)
+    assert (tmp_path / "events.jsonl").read_bytes() == whole
+    monkeypatch.undo()
+    writer.emit("progress", step=1)
+    writer.close()
+    assert [event["seq"] for event in read_events(tmp_path / "events.jsonl")[0]] == [0, 1]
+
+
+def test_a_disk_that_takes_a_line_in_pieces_gets_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.write
+    monkeypatch.setattr(os, "write", lambda descriptor, data: real(descriptor, data[:7]))
+    writer = EventWriter(tmp_path)
+    writer.emit("progress", message="ü" * 40)
+    writer.close()
+    assert [event["message"] for event in read_events(tmp_path / "events.jsonl")[0]] == ["ü" * 40]
+
+
+@pytest.mark.parametrize("version", ["", '"v": 0, ', '"v": 2, ', '"v": "1", ', '"v": null, '])
+def test_events_of_any_other_version_or_of_none_are_refused(tmp_path: Path, version: str) -> None:
+    path = tmp_path / "events.jsonl"
+    path.write_text(f'{{{version}"seq": 0, "kind": "started"}}\n')
+    with pytest.raises(InputError, match="Update gsopt"):
+        read_events(path)
+
+
+@pytest.mark.parametrize("name", [*WRITTEN_IN_PLACE, "renders/test", "previews/step_000500.ply"])
+def test_a_link_in_a_foreign_run_is_refused(tmp_path: Path, name: str) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    (run / name).parent.mkdir(parents=True)
+    elsewhere.mkdir()
+    refuse_links(run)
+    (run / name).symlink_to(elsewhere)
+    with pytest.raises(InputError, match="symbolic link"):
+        refuse_links(run)
+
+
+def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
+    """Neither a link at the name itself, nor one at the name of the temporary file."""
+    precious = tmp_path / "precious"
+    precious.write_bytes(b"precious")
+    for name in ("metrics.json", f".metrics.json.{os.getpid()}.tmp", "events.jsonl", f".a.ply.{os.getpid()}.tmp"):
+        (tmp_path / name).symlink_to(precious)
+    write_atomic(tmp_path / "metrics.json", b"{}")
+    with replacing(tmp_path / "a.ply") as file:
+        file.write(b"ply")
+    with pytest.raises(InputError, match="Cannot write"):
+        EventWriter(tmp_path)
+    assert precious.read_bytes() == b"precious"
+    assert not (tmp_path / "metrics.json").is_symlink()

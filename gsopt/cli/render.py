@@ -44,11 +44,14 @@ def main(argv: Sequence[str]) -> int:
     if flags.size is not None:
         check.within("--size", flags.size, 1, 16384, "Drop the flag for the size of the input views.")
 
+    from gsopt.events import refuse_links
     from gsopt.results.finished_run import cameras_along, open_run, render_stills, render_video
     from gsopt.results.video import VIDEO_SUFFIXES
 
     run = open_run(flags.run, flags.backend, flags.threads)
     shots = cameras_along(run, flags.path, flags.frames, flags.size)
+    if flags.output is None:
+        refuse_links(flags.run)
     output = flags.output or flags.run / "frames" / flags.path
     if output.suffix.lower() in VIDEO_SUFFIXES:
         render_video(run, shots, output, flags.fps, overwrite=flags.overwrite)

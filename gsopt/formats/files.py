@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsopt.errors import InputError
+from gsopt.events import create
 
 _REMEDIES = {
     errno.ENOSPC: "The disk is full: free some space or choose another disk. An older file of that name is untouched.",
@@ -30,7 +31,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        with create(temporary) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

@@ -15,7 +15,7 @@ from gsopt._version import __version__
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
-from gsopt.events import LARGEST_METRICS, to_json, write_atomic
+from gsopt.events import LARGEST_METRICS, refuse_links, to_json, write_atomic
 from gsopt.gaussians import Gaussians
 from gsopt.metrics import PSNR_CAP, VGG_NOTE, Lpips, capped_psnr, find_vgg_weights, ssim
 from gsopt.raster.backend import Backend, RasterSettings
@@ -108,13 +108,26 @@ def evaluate(
     evaluated under `train`, at their refined poses if the run has any. Renders go to RUN/renders/{test,train}. Raises
     InputError when run or data cannot be read.
     """
+    refuse_links(Path(run))
     finished = open_run(Path(run), backend, threads)
-    kept = read_metrics(finished.path)  # before the work, so that a broken file is not replaced
+    kept = _kept(finished)  # before the work, so that a broken file is not replaced
     scene = with_refined_poses(scene or load_scene(finished.config.data), finished.path)
     results = _results(finished, scene, vgg, on_view)
-    document = {**kept, **_about(finished), **results, "protocol": _protocol(finished, scene, results)}
+    document = {**kept, **results, "protocol": _protocol(finished, scene, results)}
     write_atomic(finished.path / "metrics.json", to_json(document))
     return document
+
+
+def _kept(finished: FinishedRun) -> dict[str, Any]:
+    """The fields of metrics.json that are kept and the facts about the run; InputError when they are no strict JSON."""
+    kept = {**read_metrics(finished.path), **_about(finished)}
+    try:
+        to_json(kept)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"metrics.json and config.json in {finished.path} must be strict JSON, got {error}. Move metrics.json away."
+        ) from error
+    return kept
 
 
 def read_metrics(run: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
 from gsopt.errors import GsoptError, InputError, UsageError, refused, shortened
-from gsopt.events import EventWriter, to_json, write_atomic
+from gsopt.events import EventWriter, refuse_links, to_json, write_atomic
 
 Listener = Callable[[Mapping[str, Any]], None]
 
@@ -63,6 +63,7 @@ def opened(path: Path, config: TrainConfig, resume: bool, listener: Listener | N
     Raises UsageError when the folder holds another run, or when `resume` finds other settings than it started with.
     """
     make_folder(path)
+    refuse_links(path)
     if not resume:
         refuse_another_run(path)
     writer = EventWriter(path)

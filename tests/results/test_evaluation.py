@@ -142,3 +142,65 @@ def test_transparent_truth_is_put_on_the_background() -> None:
 def test_no_views_have_no_mean() -> None:
     result = evaluate_views(splats(), [], ReferenceBackend(), RasterSettings(sh_degree=0), WHITE, None, vgg=False)
     assert result == {"mean": None, "per_view": []}
+
+
+def test_input_views_are_evaluated_at_their_refined_poses(tmp_path: Path) -> None:
+    """Poses as they were keep the splats perfect; a pose that the run moved draws another image."""
+    run = make_run(tmp_path, train=2, test=0)
+    scene = load_scene(str(tmp_path / "data"))
+    poses = []
+    for view in scene.train:
+        pose = view.camera.viewmats[0].double()
+        pose[:3, 3] -= pose[:3, :3] @ torch.tensor(scene.origin, dtype=torch.float64)
+        poses.append({"name": view.name, "cam_from_world": pose.tolist()})
+    (run / "poses.json").write_text(json.dumps({"views": poses}))
+    assert evaluate(run, vgg=False)["train"]["mean"]["psnr"] == PSNR_CAP
+    poses[1]["cam_from_world"][0][3] += 0.2
+    (run / "poses.json").write_text(json.dumps({"views": poses}))
+    first, second = evaluate(run, vgg=False)["train"]["per_view"]
+    assert first["psnr"] == PSNR_CAP
+    assert second["psnr"] < 40
+
+
+def test_some_of_many_input_views_are_evaluated_evenly_spread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "MAX_TRAIN_VIEWS", 3)
+    run = make_run(tmp_path, train=7, test=0)
+    names = [view.name for view in load_scene(str(tmp_path / "data")).train]
+    evaluated = [row["name"] for row in evaluate(run, vgg=False)["train"]["per_view"]]
+    assert evaluated == [names[0], names[2], names[4]]
+
+
+def test_a_metric_that_some_views_lack_has_no_mean(perfect: Path) -> None:
+    whole, other = load_scene(str(perfect.parent / "data")).test
+    small = type(other)(other.name, other.camera.resized(20, 16), _Halved(other.store), other.index)
+    views, backend = [whole, small], ReferenceBackend()
+    result = evaluate_views(splats(), views, backend, RasterSettings(sh_degree=0), WHITE, None, vgg=False)
+    assert [row["lpips_alex"] is None for row in result["per_view"]] == [False, True]
+    assert result["mean"]["lpips_alex"] is None
+    assert result["mean"]["psnr"] == pytest.approx(np.mean([row["psnr"] for row in result["per_view"]]), abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["renders", "renders/test"])
+def test_renders_do_not_leave_a_foreign_run_through_a_link(tmp_path: Path, name: str) -> None:
+    run = make_run(tmp_path, train=1, test=1)
+    (tmp_path / "elsewhere").mkdir()
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="symbolic link"):
+        evaluate(run, vgg=False)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+@pytest.mark.parametrize(("name", "key"), [("metrics.json", "extra"), ("config.json", "versions")])
+def test_fields_that_cannot_be_kept_are_an_input_error_before_the_work(tmp_path: Path, name: str, key: str) -> None:
+    """NaN, and lists nested as deep as can just be read."""
+    run = make_run(tmp_path, train=1, test=1)
+    document = json.loads((run / name).read_text()) if name == "config.json" else {}
+    (tmp_path / "data").rename(tmp_path / "gone")  # what can be kept ends here, before the work
+    errors = []
+    for value in ("NaN", *("[" * depth + "]" * depth for depth in range(900, 1000, 10))):
+        (run / name).write_text(json.dumps({**document, key: "HERE"}).replace('"HERE"', value))
+        with pytest.raises(InputError) as error:
+            evaluate(run, vgg=False)
+        errors.append(str(error.value))
+    assert "strict JSON" in errors[0]
