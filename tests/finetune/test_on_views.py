@@ -161,7 +161,7 @@ def test_large_models_recompute_their_blocks_to_the_same_change(
 ) -> None:
     config, found = ImageTrainingConfig(steps=2, batch=1, rank=2, lr=1e-2), []
     for bytes_from in (1 << 30, 0):
-        monkeypatch.setattr(training_module, "LARGE", bytes_from)
+        monkeypatch.setattr(training_module, "LARGE_UNET_BYTES", bytes_from)
         trainer = ImageTrainer(opened(base), examples, config)
         assert trainer.unet.is_gradient_checkpointing == (bytes_from == 0)
         trainer.advance()
