@@ -125,6 +125,24 @@ def cameras_at(eyes: torch.Tensor, targets: torch.Tensor) -> list[Cameras]:
     return [dataclasses.replace(model, viewmats=viewmats[i : i + 1]) for i in range(len(eyes))]
 
 
+def test_no_random_point_is_drawn_where_fewer_than_half_of_the_cameras_look() -> None:
+    """Half of these cameras look above the middle, half below: a third of the ball that they frame is not common."""
+    angles = torch.arange(8) * (torch.pi / 4)
+    eyes = 3 * torch.stack([angles.cos(), angles.sin(), torch.full((8,), 0.2)], dim=1)
+    cameras = cameras_at(eyes, torch.tensor([[0.0, 0, 1.3], [0, 0, -1.3]]).repeat(4, 1))
+    focus = find_focus(cameras, 1.0)
+    assert focus.converging
+
+    def seen(points: torch.Tensor) -> torch.Tensor:
+        return torch.stack([sees(camera, points) for camera in cameras]).sum(0)
+
+    cube = focus.radius * (2 * torch.rand(1000, 3, generator=torch.Generator().manual_seed(1)) - 1)
+    ball = cube[cube.norm(dim=1) < focus.radius]
+    assert float((2 * seen(focus.point + ball) < 8).double().mean()) > 0.2
+    points = random_points(cameras, focus, 500, False, torch.Generator().manual_seed(0))
+    assert 2 * int(seen(points).min()) >= 8
+
+
 EYES = torch.tensor([[3.0, 0, 0], [0, 3.0, 0.1], [-3.0, 0.1, 0], [0.1, -3.0, 0]])
 ARRANGEMENTS = {
     "two that face each other": cameras_at(EYES[[0, 2]], torch.zeros(2, 3)),

@@ -15,7 +15,8 @@ from gsopt.errors import UsageError
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus
 from gsopt.geometry.projection import sees
-from gsopt.init import first_gaussians
+from gsopt.geometry.voxels import Grid
+from gsopt.init import first_gaussians, hull
 from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
 from gsopt.init.thumbnails import Thumbnail, small_photos
 
@@ -115,9 +116,19 @@ def test_the_hull_is_the_same_every_time_and_for_any_number_of_threads(scene: Sc
     assert not torch.equal(other.xyz, found.xyz)
 
 
-def test_an_object_thinner_than_a_voxel_is_found(tmp_path: Path) -> None:
+def test_an_object_thinner_than_a_voxel_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    carved, empty = hull._carved, []
+
+    def watched(*args: object, cautious: bool) -> Grid:
+        grid = carved(*args, cautious=cautious)  # type: ignore[arg-type]
+        empty.append((cautious, not bool(grid.occupied.any())))
+        return grid
+
+    monkeypatch.setattr(hull, "_carved", watched)
+    monkeypatch.setattr(hull, "_MAX_SIDE", 14)  # fine voxels of 0.05
     root = ellipsoid_scene(tmp_path, spread_cameras(4, size=256), (0.0, 0.0, 0.0), (1.0, 0.02, 0.02))
     gaussians, _ = first_gaussians(load_scene(root), InitConfig(method="hull", count=500), 0, 0)
+    assert empty == [(True, False), (False, True), (True, False)]  # the box, no voxel's center, any part of a voxel
     assert float(gaussians.means[:, 0].amax()) > 0.9
     assert float(gaussians.means[:, 1:].abs().amax()) < 0.1
 
@@ -165,6 +176,21 @@ def beside(camera: Cameras, columns: float) -> torch.Tensor:
     depth = float((torch.tensor(CENTER) - camera.centers[0]) @ camera.forwards[0])
     aside = camera.viewmats[0, 0, :3] * columns * depth / float(camera.Ks[0, 0, 0])
     return (camera.centers[0] + camera.forwards[0] * depth + aside)[None].float()
+
+
+@pytest.mark.parametrize(("showing", "others", "kept"), [(2, 2, True), (2, 3, False), (1, 2, False), (3, 3, True)])
+def test_what_fewer_than_half_of_the_photos_show_is_no_hull(
+    scene: Scene, showing: int, others: int, kept: bool
+) -> None:
+    """Though all that show it have it solid, and the others carve nothing away."""
+    photos = small_photos(scene.train, 100)
+    point = beside(photos[0].camera, 0.75 * photos[0].camera.width)
+    full = [Thumbnail(photo.camera, torch.full_like(photo.planes, 255)) for photo in photos]
+    see = [bool(sees(photo.camera, point)[0]) for photo in full]
+    chosen = [photo for photo, sight in zip(full, see, strict=True) if sight][:showing]
+    chosen += [photo for photo, sight in zip(full, see, strict=True) if not sight][:others]
+    assert len(chosen) == showing + others
+    assert bool(in_hull(chosen, point)[0]) == kept
 
 
 def test_what_a_photo_with_the_whole_object_does_not_show_is_no_part_of_it(scene: Scene) -> None:

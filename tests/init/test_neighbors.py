@@ -66,6 +66,14 @@ def test_distances_are_positive_and_finite_for_few_or_equal_points(count: int) -
         assert bool(got.isfinite().all())
 
 
+def test_points_all_but_on_top_of_each_other_keep_a_thousandth_of_the_median() -> None:
+    points = torch.cat([cloud("normal", 200, 4), 1e-7 * cloud("normal", 5, 5)])
+    got = mean_neighbor_distance(points)
+    assert float(nearest_distances(points, 3).mean(1)[200:].max()) < 1e-5
+    assert torch.allclose(got[200:], 1e-3 * got.median(), rtol=1e-5)
+    assert float(got.min()) >= 0.999e-3 * float(got.median())
+
+
 def test_distances_scale_with_the_points_and_ignore_where_they_are() -> None:
     points = cloud("normal", 300, 3)
     base = mean_neighbor_distance(points)

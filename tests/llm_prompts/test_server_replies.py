@@ -11,7 +11,7 @@ import json_schema
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reply_cases import CASES, GOOD, KEY, VALID, Case
+from reply_cases import CASES, GOOD, KEY, LLM, VALID, Case
 from scripted_server import Says, completion, error, free_port, serving
 
 from gsopt import cli
@@ -26,6 +26,7 @@ pytest.importorskip("pydantic", reason="needs the extra gsopt[llm]")
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "howto" / "prompts.md"
 COMMITTED = json.loads(Path(prompts.__file__).with_name("prompts.schema.json").read_text(encoding="utf-8"))
+REPLY = [entry["text"] for entries in GOOD.values() for entry in entries]
 NOTES = ["--notes", "worn oak chair", "-n", "2", "--negatives", "1"]
 
 
@@ -59,6 +60,8 @@ def test_an_answer_ends_in_valid_prompts_or_in_a_clear_error(tmp_path: Path, cap
     assert "Traceback" not in err
     written = tmp_path / "prompts.json"
     assert written.exists() == (code == 0)
+    if case.ends == LLM:  # the reply itself, no draft and no example before it
+        assert [p.text for p in read_set(written).prompts if p.source == LLM.split()[1]] == REPLY
     if code == 0:
         assert json_schema.is_valid(json.loads(written.read_text(encoding="utf-8")), COMMITTED)
     everything = out + err + "".join(file.read_text(encoding="utf-8") for file in tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import pytest
 import tiny_sd21
 import torch
+from safetensors import safe_open
+from safetensors.torch import save
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import InputError
@@ -182,6 +185,20 @@ def test_a_broken_file_is_an_input_error(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "c.safetensors").write_bytes(data)
     with pytest.raises(InputError, match=r"c\.safetensors"):
         Conditioning.load(tmp_path / "c.safetensors")
+
+
+@pytest.mark.parametrize("version", [0, 2, None])
+def test_another_version_is_refused(tmp_path: Path, version: int | None) -> None:
+    path = tmp_path / "c.safetensors"
+    conditioning = made([Prompt("a chair")])
+    conditioning.save(path)
+    with safe_open(path, framework="pt") as file:
+        document = json.loads(file.metadata()["gsopt"])
+    assert document["version"] == 1
+    tensors = {"tokens": conditioning.tokens}
+    path.write_bytes(save(tensors, metadata={"gsopt": json.dumps({**document, "version": version})}))
+    with pytest.raises(InputError, match=rf"c\.safetensors \(version {version} instead of 1\)"):
+        Conditioning.load(path)
 
 
 @pytest.fixture(scope="module")

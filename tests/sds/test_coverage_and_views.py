@@ -58,6 +58,29 @@ def test_what_an_input_sees_is_covered_and_what_lies_behind_is_not() -> None:
     assert float(covered[BACK][inner].max()) == 0.0
 
 
+@pytest.mark.parametrize(("logit", "covered"), [(-3.6, 1.0), (0.0, 0.0)], ids=["haze", "wall"])
+def test_what_lies_behind_haze_is_covered(logit: float, covered: float) -> None:
+    """An alpha below 0.5 hides nothing, wherever its depth is."""
+    front, back = wall(0.5), wall(-0.5)
+    front = replace(front, logit_opacities=torch.full_like(front.logit_opacities, logit))
+    back = replace(back, logit_opacities=torch.full_like(back.logit_opacities, -6.0))
+    alpha = BACKEND.forward(front.append(back), camera(0), coverage.PLAIN).alphas[24:40, 24:40]
+    assert bool((alpha < coverage.SOLID).all() if covered else (alpha > coverage.SOLID).all())
+    inner = back.means[:, 1:].abs().amax(1) < 0.5
+    seen = coverage.coverage(front.append(back), [camera(0)], BACKEND)[BACK][inner]
+    assert seen.tolist() == pytest.approx([covered] * int(inner.sum()), abs=0.05)
+
+
+def test_a_large_disc_a_little_behind_the_surface_is_seen_and_a_small_one_is_not() -> None:
+    """A center may lie behind the depth map by two of its largest standard deviations."""
+    for scale, covered in ((0.3, 1.0), (0.05, 0.0)):
+        disc = wall(0.1, scale=scale)
+        middle = disc.means[:, 1:].abs().amax(1) < 1e-3
+        disc = replace(disc, **{name: tensor[middle] for name, tensor in disc.items()})
+        seen = coverage.coverage(wall(0.5).append(disc), [camera(0)], BACKEND)[-1]
+        assert float(seen) == covered
+
+
 def test_every_view_that_sees_it_adds_up_and_uncertainty_falls() -> None:
     inputs = [camera(azimuth) for azimuth in (0, 10, -10, 20)]
     means = []
@@ -74,6 +97,13 @@ def test_a_disc_seen_edge_on_does_not_count_and_a_ball_does_from_everywhere() ->
     assert float(coverage.facing(wall(0.5), torch.tensor([4.0, 0.0, 0.0])).min()) > 0.9
     ball = wall(0.5, scale=0.1, thin=0.1)
     assert coverage.facing(ball, eye).tolist() == [1.0] * len(ball)
+
+
+@pytest.mark.parametrize("eye", [(4.0, 0.0, 0.0), (0.5, 4.0, 0.0), (0.5, 0.0, -4.0), (3.0, 2.0, 1.0)])
+def test_a_needle_counts_from_everywhere(eye: tuple[float, float, float]) -> None:
+    """It has no face: only a shape that is thin along one axis alone is turned away."""
+    needle = wall(0.5, scale=0.01, thin=1.0)
+    assert coverage.facing(needle, torch.tensor(eye)).tolist() == pytest.approx([1.0] * len(needle))
 
 
 def test_the_map_is_bright_from_behind_and_dark_from_the_input() -> None:
@@ -215,6 +245,18 @@ def test_guided_steps_lie_after_the_warm_up_and_every_kth() -> None:
     guided = [step for step in range(1, 401) if resolved(CONFIG).is_guided(step)]
     assert guided == list(range(100, 301, 10))
     assert resolved(CONFIG).guided_steps == len(guided)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "iterations", "first", "last"),
+    [(0.25, 0.75, 10, 3, 7), (0.1, 0.5, 25, 3, 12), (0.5, 1.0, 7, 4, 7), (0.5, 0.5, 8, 4, 4), (0.0, 0.3, 10, 1, 3)],
+)
+def test_guidance_keeps_within_its_shares_of_the_run(
+    start: float, stop: float, iterations: int, first: int, last: int
+) -> None:
+    """From the first step that is not before start * iterations to the last that is not after stop * iterations."""
+    plan = resolved(replace(CONFIG, start=start, stop=stop, every=1), iterations)
+    assert [step for step in range(iterations + 2) if plan.is_guided(step)] == list(range(first, last + 1))
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 3, 17, 400])

@@ -12,7 +12,9 @@ from balls import Ball, mirrored, ring, write_balls
 from PIL import Image
 
 from gsopt.data.scene import Scene, load_scene
-from gsopt.init.thumbnails import small_photos
+from gsopt.geometry.voxels import Grid
+from gsopt.init.thumbnails import Thumbnail, small_photos
+from gsopt.symmetry.colors import MIN_PAIRS, disagreement
 from gsopt.symmetry.find import MAX_DISAGREEMENT, MAX_MISSES, Symmetry, find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import MAX_DISTANCE, Outline, Silhouettes, outline_pixels, signed_distance
@@ -87,6 +89,27 @@ def test_the_border_of_a_picture_is_no_outline(tmp_path: Path) -> None:
     column, row = outline_pixels(Outline.of(photo))
     assert len(row) > 0
     assert float((column - 48).square().add((row - 48).square()).sqrt().std()) < 0.3
+
+
+def test_candidates_that_end_in_one_mirror_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    n, across = slanted().normal, torch.nn.functional.normalize(torch.tensor([-0.35, 0.9, 0.0]), dim=0)
+    tilted = [
+        Mirror(torch.nn.functional.normalize(n + tilt * across, dim=0), slanted().offset) for tilt in (0.04, -0.04, 0)
+    ]
+    monkeypatch.setattr("gsopt.symmetry.find.candidates", lambda *args: tilted)
+    found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, slanted())))
+    assert [degrees_between(symmetry.mirror, slanted()) < 1 for symmetry in found] == [True]
+
+
+@pytest.mark.parametrize(("side", "known"), [(3, False), (12, True)])
+def test_few_pairs_tell_nothing_about_the_colors(side: int, known: bool) -> None:
+    """Though everything has one color: a handful of voxels could agree by chance."""
+    cameras = ring(4)
+    photos = [Thumbnail(cameras[i], torch.full((4, 96, 96), 255, dtype=torch.uint8)) for i in range(4)]
+    grid = Grid(torch.ones(side, side, side, dtype=torch.bool), torch.full((3,), -0.5), 1.0 / side)
+    pairs = int((grid.surface()[:, 0].abs() > 0.1).sum()) // 2
+    assert (pairs >= MIN_PAIRS) == known
+    assert disagreement(grid, photos, Mirror(torch.tensor([1.0, 0, 0]), 0.0), 1.0) == (0.0 if known else 1.0)
 
 
 def test_twice_the_same_bits(tmp_path: Path) -> None:
