@@ -8,13 +8,13 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 from gsopt.events import Report
 
 VERSION = 1
@@ -30,6 +30,13 @@ class Checkpoint:
     path: Path
     tensors: dict[str, Tensor]
     meta: dict[str, Any]
+
+    def seconds(self, name: str) -> float:
+        """A time that the run has spent; InputError for what is no time."""
+        value = self.meta.get(name, 0.0)
+        if type(value) not in (int, float) or not 0 <= value < 1e12:
+            raise InputError(f"The checkpoint {self.path} has {name} {shortened(value)}. Remove it, or start anew.")
+        return float(value)
 
 
 def save_checkpoint(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, Any]) -> Path:
@@ -74,10 +81,14 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """One checkpoint, or InputError saying why it cannot be used."""
     try:
         with safe_open(path, framework="pt") as file:
-            meta = json.loads((file.metadata() or {})["gsopt"])
+            meta = json.loads((file.metadata() or {})["gsopt"], parse_constant=_refuse)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
         if meta["version"] != VERSION:
             raise ValueError(f"version {meta['version']} instead of {VERSION}")
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, SafetensorError, ValueError, LookupError, ArithmeticError, TypeError, RecursionError) as error:
         raise InputError(f"The checkpoint {path} cannot be read ({error}). The one before it is used.") from error
     return Checkpoint(path, tensors, meta)
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} in its header")

@@ -169,7 +169,7 @@ def _start(
         if names != directory.recorded("train_views"):
             raise InputError(f"{scene.path} has other views than when the run began. Start in another folder.")
         trainer = Trainer.resumed(plan, scene, backend, checkpoint, guidance)
-        spent = (float(checkpoint.meta.get("seconds", 0.0)), float(checkpoint.meta.get("cpu_seconds", 0.0)))
+        spent = checkpoint.seconds("seconds"), checkpoint.seconds("cpu_seconds")
     directory.emit(
         "started",
         total=plan.schedule.iterations,

@@ -103,6 +103,17 @@ class Bands:
     def tensors(self) -> dict[str, Tensor]:
         return {"degree": torch.tensor(self.degree), **self._sums}
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
+    def restore(self, tensors: dict[str, Tensor], count: int) -> None:
+        """Take the sums over `count` Gaussians back."""
         self.degree = int(tensors["degree"])
         self._sums = {name: tensor for name, tensor in tensors.items() if name != "degree"}
+        self._require_shapes(count)
+
+    def _require_shapes(self, count: int) -> None:
+        """For `Trainer.resumed`, which turns this into an InputError that names the checkpoint."""
+        band = 2 * self.degree + 3
+        shapes = {"n": (count,), "g": (count, 3), "gg": (count, 3)}
+        shapes |= {"Y": (count, band), "YY": (count, band), "Yg": (count, band, 3)}
+        found = {name: tuple(tensor.shape) for name, tensor in self._sums.items()}
+        if not 0 <= self.degree <= self._highest or found not in ({}, shapes):
+            raise ValueError("the sums of the bands")

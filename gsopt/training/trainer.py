@@ -218,7 +218,7 @@ class Trainer:
         try:
             trainer = Trainer(plan, scene, _record(checkpoint.tensors, "gaussians"), backend, guidance)
             trainer._restore(checkpoint.tensors, checkpoint.meta)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (LookupError, ArithmeticError, AttributeError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(
                 f"The checkpoint {checkpoint.path} lacks or garbles {error}. Remove it, or start in another folder."
             ) from error
@@ -249,25 +249,29 @@ class Trainer:
 
     def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
         """Inverse of `state`."""
+        _require_alike(tensors, self.state()[0])
+        self.step = _whole("step", meta["step"], self._schedule.iterations)
+        self._last = _whole("last", meta["last"], self._schedule.iterations)
+        for name in PARAMETERS:
+            _whole(f"adam_steps.{name}", meta["adam_steps"][name], self.step)
         gaussians, exp_avg, exp_avg_sq = (_record(tensors, kind) for kind in RECORDS)
-        _require_same_shapes(gaussians.validate(), exp_avg, exp_avg_sq)
+        gaussians.validate()
         self.model = OptimizedGaussians(
             gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS}
         )
         self._density.restore(_part(tensors, "density."))
         self._resting.restore(_part(tensors, "resting."))
-        self._bands.restore(_part(tensors, "bands."))
+        self._bands.restore(_part(tensors, "bands."), len(gaussians))
         if self._guidance is not None:
             self._guidance.restore(_part(tensors, "guidance."), meta["guidance"])
         if self.poses is not None:
             self.poses.restore(_part(tensors, "poses."))
         for name, generator in self._generators.items():
             generator.set_state(tensors[f"rng.{name}"])
-        self._order.restore(tensors["epoch.order"], int(meta["epoch_position"]))
-        self._flatness = Flatness(**meta["flatness"])
-        self._last = int(meta["last"])
-        self.means = RunningMeans(**meta["shown"])
-        self.step = int(meta["step"])
+        order = _views(tensors["epoch.order"], len(self.scene.drawn))
+        self._order.restore(order, _whole("epoch_position", meta["epoch_position"], len(order)))
+        self._flatness = Flatness(**_numbers(meta["flatness"]))
+        self.means = RunningMeans(**_numbers(meta["shown"]))
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -278,8 +282,28 @@ def _record(tensors: dict[str, Tensor], kind: str) -> Gaussians:
     return Gaussians(**{name: tensors[f"{kind}.{name}"] for name in PARAMETERS})
 
 
-def _require_same_shapes(gaussians: Gaussians, *moments: Gaussians) -> None:
-    for record in moments:
-        for name, tensor in gaussians.items():
-            if getattr(record, name).shape != tensor.shape:
-                raise ValueError(f"the shape of {name}")
+def _require_alike(tensors: dict[str, Tensor], own: dict[str, Tensor]) -> None:
+    """Dtypes and shapes of a fresh trainer with as many Gaussians; those of the epoch and of guidance vary."""
+    for name, tensor in own.items():
+        varies = name == "epoch.order" or name.startswith("guidance.")
+        if not varies and (tensors[name].dtype, tensors[name].shape) != (tensor.dtype, tensor.shape):
+            raise ValueError(f"the shape of {name}")
+
+
+def _whole(name: str, value: object, most: int) -> int:
+    if type(value) is not int or not 0 <= value <= most:
+        raise ValueError(name)
+    return value
+
+
+def _views(order: Tensor, count: int) -> Tensor:
+    if order.dtype != torch.int64 or order.ndim != 1 or ((order < 0) | (order >= count)).any():
+        raise ValueError("the order of the epoch")
+    return order
+
+
+def _numbers(values: dict[str, Any]) -> dict[str, Any]:
+    for name, value in values.items():
+        if value is not None and (type(value) not in (int, float) or not abs(value) < 1e300):
+            raise ValueError(name)
+    return values

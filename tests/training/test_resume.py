@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,9 +25,9 @@ from gsopt.config.train import (
     TrainConfig,
 )
 from gsopt.data.scene import load_scene
-from gsopt.errors import UsageError
+from gsopt.errors import InputError, UsageError
 from gsopt.events import read_events
-from gsopt.training.checkpoint import read_checkpoint, saved
+from gsopt.training.checkpoint import read_checkpoint, save_checkpoint, saved
 from gsopt.training.loop import train
 from gsopt.training.plan import RunPlan
 from gsopt.training.schedule import Flatness
@@ -192,6 +194,59 @@ def test_a_broken_checkpoint_is_told_and_the_one_before_is_used(
     assert any(newest.name in message for message in warnings)
     restarted = [event["step"] for event in events if event["kind"] == "started"]
     assert restarted == [0, read_checkpoint(older).meta["step"]]
+
+
+HOSTILE: dict[str, Callable[[dict, dict], object]] = {
+    "step beyond the end": lambda tensors, meta: meta.update(step=10**9),
+    "step of 400 digits": lambda tensors, meta: meta.update(step=10**400),
+    "step as text": lambda tensors, meta: meta.update(step="7"),
+    "negative Adam steps": lambda tensors, meta: meta["adam_steps"].update(means=-1),
+    "Adam steps of 400 digits": lambda tensors, meta: meta["adam_steps"].update(sh0=10**400),
+    "no Adam steps": lambda tensors, meta: meta.update(adam_steps=[]),
+    "position before the epoch": lambda tensors, meta: meta.update(epoch_position=-(10**9)),
+    "seconds of 400 digits": lambda tensors, meta: meta.update(seconds=10**400),
+    "seconds as a list": lambda tensors, meta: meta.update(cpu_seconds=[]),
+    "flatness as text": lambda tensors, meta: meta["flatness"].update(total="1"),
+    "shown as text": lambda tensors, meta: meta["shown"].update(loss="1"),
+    "shown of 400 digits": lambda tensors, meta: meta["shown"].update(mse=10**400),
+    "no list of shown": lambda tensors, meta: meta.update(shown=None),
+    "a view that is not there": lambda tensors, meta: tensors["epoch.order"].fill_(99),
+    "a view before the first": lambda tensors, meta: tensors["epoch.order"].fill_(-99),
+    "an order of floats": lambda tensors, meta: tensors.update({"epoch.order": torch.rand(5)}),
+    "an order of no axis": lambda tensors, meta: tensors.update({"epoch.order": torch.tensor(3)}),
+    "statistics of fewer": lambda tensors, meta: tensors.update({"density.grad_sum": torch.rand(3)}),
+    "statistics of another type": lambda tensors, meta: tensors.update({"density.seen": tensors["density.seen"] > 0}),
+    "means of no axis": lambda tensors, meta: tensors.update({"gaussians.means": torch.tensor(3.0)}),
+    "no Gaussians": lambda tensors, meta: tensors.update({k: v[:0] for k, v in tensors.items() if "gaussians" in k}),
+    "moments of two axes": lambda tensors, meta: tensors.update({"exp_avg.shN": torch.rand(60, 3)}),
+    "resting views of another run": lambda tensors, meta: tensors.update({"resting.last": torch.rand(2)}),
+    "a band too high": lambda tensors, meta: tensors.update({"bands.degree": torch.tensor(9)}),
+    "sums without their names": lambda tensors, meta: tensors.update({"bands.n": torch.rand(0)}),
+    "a short generator": lambda tensors, meta: tensors.update({"rng.views": tensors["rng.views"][:9]}),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_checkpoint_is_an_input_error(name: str, stopped_run: Path, dataset: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(stopped_run, run)
+    (path,) = saved(run / "checkpoints")
+    found = read_checkpoint(path)
+    tensors, meta = dict(found.tensors), json.loads(json.dumps(found.meta))
+    HOSTILE[name](tensors, meta)
+    save_checkpoint(path.parent, found.meta["step"], tensors, meta)
+    with pytest.raises(InputError, match=path.name):
+        train(configs(dataset)["skipping"], run, resume=True)
+
+
+@pytest.fixture(scope="module")
+def stopped_run(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was stopped after 13 steps, with one checkpoint."""
+    run = tmp_path_factory.mktemp("stopped") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        act_at(patch, 13, (run / "stop").touch)
+        train(replace(configs(dataset)["skipping"], checkpoint_every=0), run)
+    return run
 
 
 def test_a_finished_run_resumed_is_left_as_it_is(dataset: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
