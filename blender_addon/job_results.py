@@ -29,7 +29,7 @@ def finish_prompts(scene: Any, work: job.Job) -> None:
         raise GsoptError(job.complaint(work))
     found = prompts.read_prompts(Path(work.product))
     about = {key: found.rest[key] for key in ("notes", "object", "domain") if key in found.rest}
-    scene.gsopt.prompts_rest = json.dumps({**json.loads(scene.gsopt.prompts_rest or "{}"), **about})
+    scene.gsopt.prompts_rest = json.dumps({**prompts.parse_rest(scene.gsopt.prompts_rest), **about})
     scene.gsopt.proposals.clear()
     for prompt in found.prompts:
         fill_prompt(scene.gsopt.proposals.add(), prompt)

@@ -19,7 +19,7 @@ from .preferences import absolute, preferences, python, work_folder
 def document(settings: Any) -> prompts.Document:
     """The panel's prompts, with what stood beside them in the file they came from."""
     listed = tuple(job_results.prompt_of(entry) for entry in settings.prompts if entry.text.strip())
-    return prompts.Document(listed, json.loads(settings.prompts_rest or "{}"))
+    return prompts.Document(listed, prompts.parse_rest(settings.prompts_rest))
 
 
 class GSOPT_OT_prompt_add(ReportingOperator, bpy.types.Operator):

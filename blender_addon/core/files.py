@@ -35,6 +35,14 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             temporary.unlink(missing_ok=True)
 
 
+def json_object(data: str | bytes) -> dict[str, Any]:
+    """Parses a JSON object. ValueError or RecursionError where there is none."""
+    document = json.loads(data)
+    if not isinstance(document, dict):
+        raise ValueError("it holds no object")
+    return document
+
+
 def encoded(value: Any) -> bytes:
     """A value as JSON. InputError for what no JSON file holds: Infinity, NaN, lone surrogates, endless nesting."""
     try:
@@ -62,10 +70,7 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
             data = file.read(largest + 1)
         if len(data) > largest:
             raise ValueError(f"it is larger than {largest} bytes")
-        document = json.loads(data)
-        if not isinstance(document, dict):
-            raise ValueError("it holds no object")
-        return document
+        return json_object(data)
     except (OSError, ValueError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"Cannot read {path}: {reason}. Choose another one.") from error

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from .errors import InputError, UsageError
+from .errors import InputError, UsageError, printable
 
 KNOWN = ("0.1", "0.2")
 """Versions of gsopt whose flags and files this extension knows, as far as the second number."""
@@ -30,7 +30,7 @@ class Answer:
     @property
     def line(self) -> str:
         lacking = f"; not installed: {', '.join(self.missing)}" if self.missing else ""
-        return f"gsopt {self.version}: {self.rasterizer}{lacking}"
+        return printable(f"gsopt {self.version}: {self.rasterizer}{lacking}")
 
 
 def find(preferred: str, allowed: Collection[str], project: Path | None, environment: Mapping[str, str]) -> Path:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import InputError
-from .files import encoded, read_json, write_json
+from .files import encoded, json_object, read_json, write_json
 
 VERSION = 1
 LARGEST_FILE = 1 << 20
@@ -113,6 +113,14 @@ def parse(document: dict[str, Any]) -> Document:
     rest = {key: value for key, value in document.items() if key not in ("version", "prompts")}
     encoded(rest)
     return Document(tuple(prompts), rest)
+
+
+def parse_rest(text: str) -> dict[str, Any]:
+    """The other keys of a file, as a .blend keeps them: JSON, empty for none. InputError for anything else."""
+    try:
+        return json_object(text or "{}")
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"What this .blend keeps beside its prompts is damaged: {error}. Read them again.") from error
 
 
 def write_prompts(path: Path, document: Document) -> None:

@@ -190,6 +190,8 @@ ANSWER = {
 def test_the_doctors_answer_is_read() -> None:
     answer = interpreter.read_answer("a warning\n" + json.dumps(ANSWER), "python")
     assert answer.line == "gsopt 0.1.0: avx2, 9.5 ms a step; not installed: sds"
+    odd = interpreter.read_answer(json.dumps({**ANSWER, "missing_extras": {"\ud800": "pip"}}), "python")
+    assert odd.line.endswith("not installed: \\ud800")
 
 
 @pytest.mark.parametrize(

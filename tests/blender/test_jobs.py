@@ -112,6 +112,18 @@ def test_a_record_that_names_a_foreign_process_neither_lives_nor_ends_it(tmp_pat
         wait(ours)
 
 
+@pytest.mark.skipif(not job.BOOT.is_file(), reason="Linux names its starts")
+def test_a_record_from_before_a_restart_names_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    running = job.start("train", [sys.executable, "-c", "import time; time.sleep(60)"], tmp_path / "job")
+    assert job.alive(running)
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "BOOT", tmp_path / "boot_id")
+        (tmp_path / "boot_id").write_text("another\n")
+        assert not job.alive(running)
+    job.end(running, force=True)
+    wait(running)
+
+
 def test_what_no_record_can_hold_is_an_error_of_ours(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="No JSON file can hold"):
         job.start("train", [sys.executable, "-c", "", "\udcff"], tmp_path)

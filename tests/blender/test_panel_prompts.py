@@ -25,6 +25,16 @@ def test_prompts_stay_in_the_blend_and_in_the_file(panel: Any, tmp_path: Path) -
     assert written == {"version": 1, "made": made, "prompts": [{**prompts[0], "rationale": ""}]}
 
 
+def test_a_damaged_blend_ends_in_a_message(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    panel.prompts.add().text = "a chair"
+    for rest in ("{", "[]", "[" * 100_000, '{"notes": Infinity}', '{"notes": "\\ud800"}'):
+        panel.prompts_rest = rest
+        fails_with(". ", bpy.ops.gsopt.prompts_write, filepath=str(tmp_path / "a.json"))
+    assert not (tmp_path / "a.json").exists()
+
+
 def test_proposals_are_taken_one_by_one(panel: Any) -> None:
     import bpy
 
