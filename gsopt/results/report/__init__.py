@@ -21,5 +21,5 @@ def write_report(run: Path) -> Path:
     run = Path(run)
     config = TrainConfig.read(run / "config.json")
     path = run / "report.html"
-    write_atomic(path, page(read_run(run, config)).encode())
+    write_atomic(path, page(read_run(run, config)).encode("utf-8", "backslashreplace"))
     return path

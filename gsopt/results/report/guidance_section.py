@@ -12,6 +12,7 @@ from PIL import Image
 from gsopt.data.files import is_regular, read_json
 from gsopt.errors import InputError
 from gsopt.results.report.embedded_images import data_uri, read_image
+from gsopt.results.report.values import number, text
 
 IMAGE_SIDE = 256
 MAX_ROWS = 8
@@ -50,11 +51,11 @@ def summary_text(summary: dict[str, Any]) -> str:
     guard = summary.get("guard")
     reason = guard.get("reason") if isinstance(guard, dict) else None
     weight, factor = summary.get("lambda_sds"), guard.get("factor", 1.0) if isinstance(guard, dict) else 1.0
-    if isinstance(weight, int | float) and isinstance(factor, int | float):
-        weight = f"{weight * factor:g}"
+    if (weight_number := number(weight)) is not None and (factor_number := number(factor)) is not None:
+        weight = f"{weight_number * factor_number:g}"
     sentences = [
-        f"{summary.get('model', 'A diffusion prior')}, policy {summary.get('policy', 'unknown')}, "
-        f"lambda {'unknown' if weight is None else weight}" + (f" ({reason})." if reason else "."),
+        f"{text(summary.get('model', 'A diffusion prior'))}, policy {text(summary.get('policy', 'unknown'))}, "
+        f"lambda {'unknown' if weight is None else text(weight)}" + (f" ({text(reason)})." if reason else "."),
         f"{guided} of {wanted} steps scheduled for guidance were guided.",
     ]
     if decided:
@@ -73,9 +74,9 @@ def _view(folder: Path, view: int) -> Row:
 
 def _step(folder: Path, sample: dict[str, Any]) -> Row:
     step = _whole(sample.get("step"))
-    text = str(sample.get("text") or "")[:200]
+    prompt = text(sample.get("text") or "")[:200]
     images = _images(folder, (f"step_{step:06d}_{kind}" for kind in PROPOSAL))
-    return f"step {step:,}" + (f": {text}" if text else ""), images
+    return f"step {step:,}" + (f": {prompt}" if prompt else ""), images
 
 
 def _images(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
@@ -83,7 +84,7 @@ def _images(folder: Path, names: Iterable[str]) -> list[Image.Image | None]:
 
 
 def _cards(title: str, kinds: Iterable[str], rows: list[Row]) -> str:
-    shown = [(text, images) for text, images in rows if any(images)]
+    shown = [(line, images) for line, images in rows if any(images)]
     if not shown:
         return ""
     cards = "".join(
@@ -94,8 +95,8 @@ def _cards(title: str, kinds: Iterable[str], rows: list[Row]) -> str:
             for kind, image in zip(kinds, images, strict=True)
             if image is not None
         )
-        + f'</div><p class="muted">{escape(text)}</p></article>'
-        for text, images in shown
+        + f'</div><p class="muted">{escape(line)}</p></article>'
+        for line, images in shown
     )
     return f'<h3>{escape(title)}</h3><div class="cards">{cards}</div>'
 

@@ -11,7 +11,8 @@ from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
 from gsopt.results.report.charts import line_chart
 from gsopt.results.report.embedded_images import animation_uri, data_uri, error_legend, error_map, shrunk
-from gsopt.results.report.read_run import EvaluatedView, Report, number
+from gsopt.results.report.read_run import EvaluatedView, Report
+from gsopt.results.report.values import number, text
 
 VIEW_SIDE = 400
 NO_VALUE = "\N{EN DASH}"
@@ -96,11 +97,11 @@ def _tile(title: str, value: str, hint: str | None) -> str:
 def messages(report: Report) -> str:
     """Warnings (each once), the reason when nothing was held out, and notes of the evaluation."""
     notes = report.metrics.get("notes")
-    texts = [*report.messages, *(map(str, notes) if isinstance(notes, list) else [])]
+    texts = [*report.messages, *(map(text, notes) if isinstance(notes, list) else [])]
     reason = report.metrics.get("reason")
     if isinstance(reason, str):
         texts.insert(0, reason)
-    items = "".join(f"<li>{escape(text)}</li>" for text in dict.fromkeys(texts) if text)
+    items = "".join(f"<li>{escape(line)}</li>" for line in dict.fromkeys(texts) if line)
     return f'<section class="messages"><h2>Notes</h2><ul>{items}</ul></section>\n' if items else ""
 
 
@@ -188,7 +189,7 @@ def settings(report: Report) -> str:
     rows = "".join(_setting_rows(report.config.to_dict(), default))
     facts = {"first Gaussians": report.recorded.get("gaussians_init"), "symmetry": _symmetry(report)}
     extra = "".join(
-        f"<tr><th scope='row'>{name}</th><td>{escape(str(fact))}</td></tr>" for name, fact in facts.items() if fact
+        f"<tr><th scope='row'>{name}</th><td>{escape(text(fact))}</td></tr>" for name, fact in facts.items() if fact
     )
     return (
         "<section><details><summary>Settings</summary><p class='muted'>Values other than the default are bold.</p>"
@@ -201,7 +202,7 @@ def _symmetry(report: Report) -> str:
     mirrors = report.recorded.get("symmetry")
     if not isinstance(mirrors, list):
         return ""
-    return "; ".join(str(mirror["about"]) for mirror in mirrors if isinstance(mirror, dict) and "about" in mirror)
+    return "; ".join(text(mirror["about"]) for mirror in mirrors if isinstance(mirror, dict) and "about" in mirror)
 
 
 def _setting_rows(values: dict[str, Any], default: dict[str, Any], prefix: str = "") -> Iterable[str]:
@@ -219,11 +220,11 @@ def _setting_rows(values: dict[str, Any], default: dict[str, Any], prefix: str =
 def footer(report: Report) -> str:
     """Evaluation protocol, versions and seed."""
     protocol = report.metrics.get("protocol")
-    text = f"<p>{escape(protocol)}</p>" if isinstance(protocol, str) else ""
+    note = f"<p>{escape(protocol)}</p>" if isinstance(protocol, str) else ""
     versions = report.recorded.get("versions")
     pairs = versions.items() if isinstance(versions, dict) else [("gsopt", __version__)]
-    line = " · ".join(f"{escape(str(name))} {escape(str(version))}" for name, version in pairs)
-    return f"<footer>{text}<p>{line} · seed {report.config.seed}</p></footer>\n"
+    line = " · ".join(f"{escape(name)} {escape(text(version))}" for name, version in pairs)
+    return f"<footer>{note}<p>{line} · seed {report.config.seed}</p></footer>\n"
 
 
 def figure(key: str, value: float | None) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from PIL import Image
 
-from gsopt.config.from_json import MAX_JSON_NUMBER
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
@@ -22,6 +21,7 @@ from gsopt.results.finished_run import FinishedRun, camera_path, open_run, truth
 from gsopt.results.report.cameras_section import cameras_section
 from gsopt.results.report.embedded_images import shrunk
 from gsopt.results.report.guidance_section import guidance_section
+from gsopt.results.report.values import number, text
 from gsopt.results.video import as_image
 
 MAX_EVALUATED_VIEWS = 12
@@ -98,7 +98,7 @@ def read_run(run: Path, config: TrainConfig) -> Report:
         progress=progress_of(events),
         messages=messages,
     )
-    messages += [text for event in events if (text := _message(event)) is not None]
+    messages += [message for event in events if (message := _message(event)) is not None]
     report.guidance = guidance_section(run, messages)
     report.cameras = cameras_section(Path(config.data.path), run, messages)
     _add_figures(report)
@@ -110,13 +110,6 @@ def read_run(run: Path, config: TrainConfig) -> Report:
     except GsoptError as error:
         messages.append(f"Some images are missing from this report. {error}")
     return report
-
-
-def number(value: object) -> float | None:
-    """A finite number, or None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_JSON_NUMBER:
-        return None
-    return float(value)
 
 
 def progress_of(events: Sequence[dict[str, Any]]) -> list[Progress]:
@@ -156,7 +149,7 @@ def _message(event: dict[str, Any]) -> str | None:
     if event.get("kind") not in ("warning", "error"):
         return None
     prefix = "The run ended with an error: " if event["kind"] == "error" else ""
-    return prefix + str(event.get("message", ""))
+    return prefix + text(event.get("message", ""))
 
 
 def _read_object(path: Path, messages: list[str]) -> dict[str, Any]:
@@ -179,7 +172,7 @@ def _add_figures(report: Report) -> None:
     mean, rows = source.get("mean"), source.get("per_view")
     report.mean = {key: number(mean.get(key)) for key in METRICS} if isinstance(mean, dict) else {}
     report.per_view = [
-        {"name": str(row.get("name")), **{key: number(row.get(key)) for key in METRICS}}
+        {"name": text(row.get("name")), **{key: number(row.get(key)) for key in METRICS}}
         for row in (rows if isinstance(rows, list) else [])
         if isinstance(row, dict)
     ]

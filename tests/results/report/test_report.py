@@ -19,7 +19,8 @@ from gsopt.results.evaluation import evaluate
 from gsopt.results.report import charts, write_report
 from gsopt.results.report.embedded_images import ERROR_COLORS, ERROR_FULL_SCALE, error_map
 from gsopt.results.report.page import duration
-from gsopt.results.report.read_run import number, progress_of, representative_rows
+from gsopt.results.report.read_run import progress_of, representative_rows
+from gsopt.results.report.values import number
 
 VOID = {"meta", "link", "img", "br", "source", "line", "circle", "polyline"}
 SIZE_LIMIT = 8 << 20
