@@ -8,6 +8,7 @@ to finish its step, save and exit. A reader tails by byte offset up to the last 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import time
@@ -41,12 +42,27 @@ def write_atomic(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise InputError(
             f"Cannot write {path}: {error.strerror or error}. Free some space or choose another folder."
         ) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the new names in a folder outlast a power cut; Windows and some network disks cannot."""
+    if os.name == "nt":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def create(temporary: Path) -> BinaryIO:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsopt.errors import InputError
-from gsopt.events import create
+from gsopt.events import create, sync_folder
 
 _REMEDIES = {
     errno.ENOSPC: "The disk is full: free some space or choose another disk. An older file of that name is untouched.",
@@ -36,6 +36,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(path.parent)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "Free some space or choose another folder.")
         raise InputError(f"Cannot write {path}: {error.strerror or error}. {remedy}") from error

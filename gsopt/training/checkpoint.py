@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gsopt.errors import InputError, shortened
-from gsopt.events import Report
+from gsopt.events import Report, create, sync_folder
 
 VERSION = 1
 KEEP = 2
@@ -46,10 +46,14 @@ def save_checkpoint(folder: Path, step: int, tensors: dict[str, Tensor], meta: d
     header = {"gsopt": json.dumps({"version": VERSION, **meta}, allow_nan=False, sort_keys=True)}
     try:
         folder.mkdir(exist_ok=True)
+        with create(temporary) as file:
+            mode = os.fstat(file.fileno()).st_mode
         save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, temporary, metadata=header)
+        temporary.chmod(mode)  # safetensors puts a file of its own there, which nobody else may read
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(folder)  # before an older one goes
     except (OSError, SafetensorError) as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -14,9 +14,11 @@ from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import UsageError
 from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import Gaussians
+from gsopt.metrics import find_vgg_weights
 from gsopt.results.evaluation import evaluate, read_metrics
 from gsopt.results.report import write_report
 from gsopt.training.guided.start import require_guidance
+from gsopt.training.interrupt import Stopped, StopRequest
 from gsopt.training.loop import TrainResult, train
 from gsopt.training.run_directory import Listener, opened, refuse_another_run
 
@@ -56,12 +58,14 @@ def reconstruct(
     if not resume:
         refuse_another_run(run)
         require_guidance(config.guidance)
+    find_vgg_weights()  # a variable that names no file is noticed now, not after the training
     config = _with_poses(config, run, log)
-    result = train(config, run, resume=resume, on_progress=on_progress, done=False)
-    if result.stopped:
-        return Reconstruction(result.run, result.gaussians, None, None)
-    log(f"trained in {timedelta(seconds=round(result.train_seconds))}; evaluating {result.run / 'splat.ply'}")
-    metrics, report = _evaluated(config, result, on_progress)
+    with StopRequest(run / "stop") as stop:
+        result = train(config, run, resume=resume, on_progress=on_progress, done=False)
+        if result.stopped:
+            return Reconstruction(result.run, result.gaussians, None, None)
+        log(f"trained in {timedelta(seconds=round(result.train_seconds))}; evaluating {result.run / 'splat.ply'}")
+        metrics, report = _evaluated(config, result, on_progress, stop)
     return Reconstruction(result.run, result.gaussians, metrics, report)
 
 
@@ -110,8 +114,13 @@ def _with_poses(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
     return replace(config, data=replace(config.data, path=str(scene)))
 
 
-def _evaluated(config: TrainConfig, result: TrainResult, listener: Listener | None) -> tuple[dict[str, Any], Path]:
-    """Evaluate, write the report, and end the run with the event `done` (`error` when one of these fails)."""
+def _evaluated(
+    config: TrainConfig, result: TrainResult, listener: Listener | None, stop: StopRequest
+) -> tuple[dict[str, Any] | None, Path | None]:
+    """Evaluate, write the report, and end the run with the event `done`.
+
+    It is `error` when one of these fails, and `stopped`, with neither metrics nor report, when someone asked for it.
+    """
     facts = {
         "train_seconds": round(result.train_seconds, 3),
         "train_cpu_seconds": round(result.cpu_seconds, 3),
@@ -122,7 +131,12 @@ def _evaluated(config: TrainConfig, result: TrainResult, listener: Listener | No
     }
     with opened(result.run, config, resume=True, listener=listener) as directory:
         write_atomic(result.run / "metrics.json", to_json({**read_metrics(result.run), **facts}))
-        metrics = evaluate(result.run, threads=config.threads, scene=result.scene)
+        ended = {"step": result.steps, "n": len(result.gaussians), "seconds": facts["train_seconds"]}
+        try:
+            metrics = evaluate(result.run, threads=config.threads, scene=result.scene, on_view=stop.check)
+        except Stopped:
+            directory.emit("stopped", **ended)
+            return None, None
         report = write_report(result.run)
-        directory.emit("done", step=result.steps, n=len(result.gaussians), seconds=facts["train_seconds"])
+        directory.emit("done", **ended)
     return metrics, report

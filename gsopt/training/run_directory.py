@@ -22,8 +22,8 @@ Listener = Callable[[Mapping[str, Any]], None]
 WORK = ("splat.ply", "metrics.json", "report.html", "previews/*", "checkpoints/*.safetensors")
 # Settings that may differ when a run is resumed: they do not change a bit of the result.
 FREE = ("threads", "checkpoint_every", "preview_every", "data.cache_mb")
-# How whole-or-nothing writers name a file before it is whole: a dot, its name, the process.
-TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
+# Names of files before they are whole: a dot, the name, the process; and what safetensors takes.
+TEMPORARY = re.compile(r"\..+\.\d+\.tmp|\.tmp\w{6}")
 PACKAGES = ("torch", "numpy", "pillow", "safetensors")
 
 
@@ -73,7 +73,8 @@ def opened(path: Path, config: TrainConfig, resume: bool, listener: Listener | N
         run.stop_file.unlink(missing_ok=True)  # a request to an earlier run, which heeded it
         run.previews.mkdir(exist_ok=True)
         run.checkpoints.mkdir(exist_ok=True)
-        sweep(path, run.previews, run.checkpoints)
+        folders = ("previews", "checkpoints", "guidance", "renders/test", "renders/train")
+        sweep(path, *(path / name for name in folders if (path / name).is_dir()))
         yield run
     except BaseException as error:
         run.emit("error", message=describe(error), exit_code=exit_code(error))

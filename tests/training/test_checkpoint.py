@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -100,3 +101,34 @@ def test_a_disk_that_refuses_leaves_the_old_checkpoints_and_no_temporary(
         with pytest.raises(InputError, match="No space left on device"):
             save_checkpoint(tmp_path, step, {"a": torch.ones(9)}, {})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask and flushes no folder")
+def test_others_may_read_it_as_the_umask_says(tmp_path: Path) -> None:
+    for mask in (0o022, 0o077, 0o002):
+        before = os.umask(mask)
+        try:
+            path = save_checkpoint(tmp_path, 1, TENSORS, {})
+        finally:
+            os.umask(before)
+        assert path.stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask and flushes no folder")
+def test_the_new_name_is_on_the_disk_before_an_old_checkpoint_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for step in (1, 2):
+        save_checkpoint(tmp_path, step, TENSORS, {})
+    done: list[str] = []
+    fsync, replace, unlink = os.fsync, os.replace, Path.unlink
+
+    def flush(descriptor: int) -> None:
+        done.append("folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", flush)
+    monkeypatch.setattr(os, "replace", lambda *names: (done.append("rename"), replace(*names)))
+    monkeypatch.setattr(Path, "unlink", lambda path, **known: (done.append("unlink"), unlink(path, **known)))
+    save_checkpoint(tmp_path, 3, TENSORS, {})
+    assert done[-4:] == ["file", "rename", "folder", "unlink"]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ import gsopt
 from gsopt import cli
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.errors import GsoptError, InputError, SettingError, UsageError
+from gsopt.events import read_events
 
 SHORT = {"iterations": 4, "init": {"method": "random", "count": 20}, "guidance": {"lambda_sds": 0.0}}
 FLAGS = "--iterations 4 --init random --init-count 20 --lambda_sds 0 --views 2"
@@ -69,6 +72,37 @@ def test_a_wrong_setting_or_prompt_is_refused_before_any_work(settings, error, t
     with pytest.raises(error, match=text):
         gsopt.reconstruct(tmp_path / "absent", tmp_path / "run", **settings)
     assert not (tmp_path / "run").exists()
+
+
+def test_weights_that_are_not_there_are_noticed_before_any_work(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSOPT_LPIPS_VGG", str(tmp_path / "absent.npz"))
+    with pytest.raises(InputError, match=r"absent\.npz"):
+        gsopt.reconstruct(data, tmp_path / "run", **SHORT)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("moment", ["gsopt.training.reconstruct.evaluate", "gsopt.training.loop._finish"])
+def test_a_run_that_is_stopped_while_it_is_evaluated_ends_as_stopped_and_resumes(
+    moment: str, number: signal.Signals, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, name = moment.rsplit(".", 1)
+    original = getattr(importlib.import_module(module), name)
+
+    def signalled(*args, **kwargs):
+        signal.raise_signal(number)
+        return original(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(moment, signalled)
+        stopped = gsopt.reconstruct(data, tmp_path / "run", **SHORT)
+    assert (stopped.metrics, stopped.report) == (None, None)
+    assert read_events(tmp_path / "run" / "events.jsonl")[0][-1]["kind"] == "stopped"
+    again = gsopt.reconstruct(None, tmp_path / "run", resume=True)
+    assert again.metrics is not None
+    assert read_events(tmp_path / "run" / "events.jsonl")[0][-1]["kind"] == "done"
 
 
 def test_a_missing_dataset_is_an_error_of_gsopt(tmp_path: Path) -> None:

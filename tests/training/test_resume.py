@@ -271,7 +271,7 @@ def test_other_settings_are_refused_on_resume_but_threads_may_change(dataset: Pa
     train(replace(config, threads=3, preview_every=0), run, resume=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_lets_the_step_finish_and_saves(
     number: signal.Signals, dataset: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -283,6 +283,18 @@ def test_a_signal_lets_the_step_finish_and_saves(
     assert (result.stopped, result.steps) == (True, 8)
     assert signal.getsignal(number) is before
     assert run_bytes(config, run, resume=True) == whole["adc"]
+
+
+def test_what_killed_writers_left_is_swept(stopped_run: Path, dataset: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(stopped_run, run)
+    for name in (".", "previews", "checkpoints", "guidance", "renders/test", "renders/train"):
+        (run / name).mkdir(parents=True, exist_ok=True)
+        for left in (".splat.ply.123.tmp", ".tmpq1W2e3"):
+            (run / name / left).write_bytes(b"half")
+        (run / name / "mine.tmp").write_bytes(b"whole")
+    train(replace(configs(dataset)["skipping"], checkpoint_every=0), run, resume=True)
+    assert {path.name for path in run.rglob("*tmp*")} == {"mine.tmp"}
 
 
 def test_a_second_interrupt_does_not_wait(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
