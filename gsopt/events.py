@@ -84,10 +84,10 @@ def refuse_links(run: Path) -> None:
 
 def to_json(value: Any) -> bytes:
     """Readable, strict JSON (NaN is refused) with a final newline."""
-    return _encoded(json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    return encoded(json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def _encoded(text: str) -> bytes:
+def encoded(text: str) -> bytes:
     """UTF-8; of file names that are none, the bytes that are no text as the escapes JSON has for them."""
     return text.encode("utf-8", "backslashreplace")
 
@@ -113,7 +113,7 @@ class EventWriter:
     def emit(self, kind: str, **fields: Any) -> dict[str, Any]:
         """One line, one write; returns the event."""
         event = {"v": VERSION, "seq": self._seq, "kind": kind, "time": round(time.time(), 3), **fields}
-        self._append(_encoded(json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n"))
+        self._append(encoded(json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n"))
         self._seq += 1
         return event
 

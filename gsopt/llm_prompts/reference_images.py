@@ -16,7 +16,7 @@ from gsopt import check
 from gsopt._optional import require
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.errors import UsageError
-from gsopt.events import Report, write_atomic
+from gsopt.events import Report, encoded, write_atomic
 from gsopt.sds.prompts import MAX_IMAGES, Prompt, ReferenceImage
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def generate_images(
         name = _free_name(folder)
         write_atomic(folder / name, _png(image))
         images.append(ReferenceImage(f"{folder.name}/{name}", prompt.text, prior.folder.name[-200:]))
-    write_atomic(folder / PAGE, contact_sheet(images).encode())
+    write_atomic(folder / PAGE, encoded(contact_sheet(images)))
     return tuple(images), None
 
 

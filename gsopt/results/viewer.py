@@ -60,7 +60,8 @@ class RunFollower:
     def _update(self, event: dict[str, Any]) -> Update | None:
         kind = event.get("kind")
         if kind == "preview":
-            return Update(self._inside(event.get("path")), f"step {event.get('step')}")
+            step = event.get("step")
+            return Update(self._inside(event.get("path")), f"step {step}" if type(step) is int else "preview")
         if kind in LAST:
             return Update(self._inside("splat.ply"), str(kind))
         return None
@@ -69,8 +70,11 @@ class RunFollower:
         """The file `name` of the run, or None when it is missing or outside the run directory."""
         if not isinstance(name, str):
             return None
-        path = (self.run / name).resolve()
-        return path if path.is_relative_to(self.run.resolve()) and path.is_file() else None
+        try:
+            path = (self.run / name).resolve()
+            return path if path.is_relative_to(self.run.resolve()) and path.is_file() else None
+        except (OSError, ValueError, RuntimeError):  # too long, no text or a NUL, a circle of links
+            return None
 
 
 class SplatViewer:
@@ -78,7 +82,8 @@ class SplatViewer:
 
     def __init__(self, host: str, port: int) -> None:
         self._server = start_server(host, port)
-        self._caption = self._server.gui.add_markdown("waiting for the first splats")
+        # Not Markdown: viser runs the scripts in it, and a caption may hold the name of a stranger's file.
+        self._caption = self._server.gui.add_text("splats", "waiting for the first ones", disabled=True)
         show = self._server.gui.add_checkbox("input cameras", initial_value=True)
         self._frames = self._server.scene.add_frame("/cameras", show_axes=False)
         show.on_update(lambda _: setattr(self._frames, "visible", show.value))
@@ -99,7 +104,7 @@ class SplatViewer:
             rgbs=sh.rgb_from_sh0(gaussians.sh0[:, 0]).clamp(0, 1).numpy(),
             opacities=gaussians.opacities[:, None].numpy(),
         )
-        self._caption.content = f"{caption}: {len(gaussians)} Gaussians"
+        self._caption.value = f"{caption}: {len(gaussians)} Gaussians".encode(errors="backslashreplace").decode()
 
     def show_cameras(self, cameras: list[Cameras], radius: float) -> None:
         """Adds a frustum per camera and turns their mean up axis up; `radius` of the scene sets their size."""

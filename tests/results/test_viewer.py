@@ -103,12 +103,25 @@ def test_a_run_that_ended_without_a_result_keeps_the_last_preview(run: Path) -> 
     assert update == viewer.Update((run / "previews/step_000001.ply").resolve(), "error")
 
 
-@pytest.mark.parametrize("path", ["../outside.ply", "/etc/hostname", None, 7, "previews", "previews/absent.ply"])
+NO_PATHS = ["../outside.ply", "/etc/hostname", None, 7, "previews", "previews/absent.ply"]
+NO_PATHS += ["a\0b.ply", "\ud800.ply", "caf\udce9.ply", "x" * 300, "x/" * 3000, "circle/a.ply", ["previews"], ""]
+
+
+@pytest.mark.parametrize("path", NO_PATHS)
 def test_a_path_that_leads_out_of_the_run_or_nowhere_is_ignored(run: Path, path: object) -> None:
     save_splats(run.parent / "outside.ply", gaussians())
+    (run / "circle").symlink_to("circle")
     emit(run, {"kind": "preview", "step": 1, "path": path})
     update = viewer.RunFollower(run).poll()
     assert update is None or update.splats is None
+
+
+@pytest.mark.parametrize("step", [None, "{alert(1)}", "![](http://evil.example)", [[1]], True, 1.5])
+def test_a_caption_holds_no_text_of_the_events(run: Path, step: object) -> None:
+    emit(run, {**preview(run, 1), "step": step})
+    update = viewer.RunFollower(run).poll()
+    assert update is not None
+    assert update.caption == "preview"
 
 
 class Recorder:
@@ -162,6 +175,13 @@ def test_splats_are_sent_after_activation(recorder: Recorder) -> None:
     torch.testing.assert_close(variances, model.scales.square().sort(dim=1).values, rtol=1e-4, atol=1e-6)
     assert splats.rgbs.min() >= 0
     assert splats.rgbs.max() <= 1
+
+
+def test_the_name_of_a_file_is_displayed_as_plain_text(recorder: Recorder, tmp_path: Path) -> None:
+    save_splats(tmp_path / "{alert(1)}caf\udce9.ply", gaussians())
+    viewer.view_file(viewer.SplatViewer("127.0.0.1", 0), tmp_path / "{alert(1)}caf\udce9.ply")
+    recorder.server.gui.add_markdown.assert_not_called()
+    assert recorder.server.gui.add_text.return_value.value == "{alert(1)}caf\\udce9.ply: 5 Gaussians"
 
 
 @pytest.mark.parametrize("n", [0, 1, 7])

@@ -17,7 +17,7 @@ from gsopt.benchmark.suite import definition as declared
 from gsopt.benchmark.suite.aggregate import Variant
 from gsopt.benchmark.suite.tables import GroupSection, about, group_sections, missing
 from gsopt.errors import InputError
-from gsopt.events import write_atomic
+from gsopt.events import encoded, write_atomic
 from gsopt.results.report.page import html_document
 
 STYLE = (
@@ -31,7 +31,7 @@ CELL_SIDE, CELL_GAP, JPEG_QUALITY = 150, 6, 85
 
 def write_html(document: dict[str, Any], images: dict[str, Any], path: Path) -> None:
     """Write the page."""
-    write_atomic(path, page(document, images).encode())
+    write_atomic(path, encoded(page(document, images)))
 
 
 def page(document: dict[str, Any], images: dict[str, Any]) -> str:

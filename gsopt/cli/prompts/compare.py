@@ -126,7 +126,7 @@ def distinct_names(files: Sequence[Path]) -> list[str]:
 
 def write_page(flags: Flags, compared: Comparison, prior: str) -> None:
     """The page and its figures."""
-    from gsopt.events import to_json, write_atomic
+    from gsopt.events import encoded, to_json, write_atomic
     from gsopt.results.report.prompt_comparison import Column, comparison_page
 
     columns = [
@@ -147,7 +147,7 @@ def write_page(flags: Flags, compared: Comparison, prior: str) -> None:
         "views": list(compared.views),
         "arms": [{"name": c.name, "mean": c.mean, "psnr": list(c.psnrs), "alignment": c.alignment} for c in columns],
     }
-    write_atomic(flags.output, comparison_page(title, facts, compared.views, truths, columns).encode())
+    write_atomic(flags.output, encoded(comparison_page(title, facts, compared.views, truths, columns)))
     write_atomic(flags.output.with_suffix(".json"), to_json(document))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsopt.config.train import TrainConfig
-from gsopt.events import write_atomic
+from gsopt.events import encoded, write_atomic
 from gsopt.results.report.page import page
 from gsopt.results.report.read_run import read_run
 
@@ -21,5 +21,5 @@ def write_report(run: Path) -> Path:
     run = Path(run)
     config = TrainConfig.read(run / "config.json")
     path = run / "report.html"
-    write_atomic(path, page(read_run(run, config)).encode("utf-8", "backslashreplace"))
+    write_atomic(path, encoded(page(read_run(run, config))))
     return path
