@@ -16,6 +16,8 @@ from urllib.parse import urlsplit
 from gsopt._optional import require
 from gsopt.errors import InputError
 
+_REFUSAL = "Open the viewer by an address such as http://127.0.0.1:8080, as localhost or by the name given to --host.\n"
+
 
 def start_server(host: str, port: int) -> Any:
     """A running viser server on `host`, port `port` or the next free one. Raises MissingDependency without viser."""
@@ -73,7 +75,7 @@ def _checked_handshakes(host: str) -> Iterator[list[int]]:
         def process(connection: Any, request: Any) -> Any:
             if _is_allowed(request.headers, host):
                 return process_request(connection, request)
-            return connection.respond(403, f"Open the viewer as http://{host}:PORT, by name localhost or by address.\n")
+            return connection.respond(403, _REFUSAL)
 
         guarded.append(port)
         return serve(handler, address, port, process_request=process, **options)

@@ -8,6 +8,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -134,3 +135,30 @@ def test_ply_with_any_words_in_its_header(folder: Path, good: dict[str, bytes], 
         st.sampled_from([b"float", b"list", b"x\nproperty double", b"vertex", b"-1", b"999999999999", b"0\n", b"2"])
     )
     load(folder, name, b" ".join(words) + b"end_header\n" + body)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["float", "double"])
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_a_signaling_nan_is_refused_without_a_warning(
+    folder: Path, good: dict[str, bytes], kind: str, order: str
+) -> None:
+    head, body = good["a.ply"].split(b"end_header\n", 1)
+    rows = np.frombuffer(body, "<f4").astype(np.float64 if kind == "double" else np.float32)
+    bits = np.uint64(0x7FF0000000000001) if kind == "double" else np.uint32(0x7F800001)
+    rows.view(bits.dtype)[0] = bits
+    data = rows.astype(rows.dtype.newbyteorder("<" if order == "little" else ">"))
+    head = head.replace(b"property float", f"property {kind}".encode()).replace(b"little", order.encode())
+    (folder / "nan.ply").write_bytes(head + b"end_header\n" + data.tobytes())
+    with pytest.raises(InputError, match="must be finite"):
+        load_splats(folder / "nan.ply")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["a.splat", "a.glb", "a.compressed.ply"])
+@pytest.mark.parametrize("nan", [b"\x01\0\x80\x7f", b"\x01\0\x80\xff"])
+def test_a_signaling_nan_anywhere_prints_no_warning(
+    folder: Path, good: dict[str, bytes], name: str, nan: bytes
+) -> None:
+    for at in range(len(good[name]) % 4, len(good[name]) - 3, 4):
+        load(folder, name, good[name][:at] + nan + good[name][at + 4 :])
