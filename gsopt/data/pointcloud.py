@@ -38,7 +38,8 @@ def read_points_ply(path: Path) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 
 
 def _columns(vertices: np.ndarray, names: Iterable[str]) -> np.ndarray:
     """Properties side by side; ValueError or TypeError for one that is a list."""
-    return np.stack([np.asarray(vertices[name], dtype=np.float64) for name in names], axis=1)
+    with np.errstate(invalid="ignore"):  # a signaling NaN warns of its conversion
+        return np.stack([np.asarray(vertices[name], dtype=np.float64) for name in names], axis=1)
 
 
 def _check_counts(path: Path) -> None:

@@ -13,6 +13,8 @@ from torch import Tensor
 from gsopt.data.lens import Lens
 from gsopt.errors import InputError
 
+MAX_NAME = 255
+"""Characters of a name in a warning."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of |RᵀR - I|: files written with four digits pass, a scaled or sheared camera does not."""
 
@@ -91,6 +93,7 @@ def check_enough(frames: list[PosedImage], absent: list[str], path: Path) -> Non
 
 
 def summarize_names(names: list[str], most: int = 5) -> str:
-    """The first few names and how many more there are, for a warning of one line."""
+    """The first few names, shortened, and how many more there are, for a warning of one line."""
     rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    short = (name if len(name) <= MAX_NAME else f"{name[:MAX_NAME]}..." for name in names[:most])
+    return ", ".join(short) + (f" and {rest} more" if rest > 0 else "")

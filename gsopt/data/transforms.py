@@ -91,9 +91,8 @@ def _frame(
     if isinstance(entry.get("mask_path"), str):
         mask = files.child(path.parent, entry["mask_path"])
         if not files.is_regular(mask):
-            warnings.append(
-                f"The mask {entry['mask_path']} of {entry['file_path']} is absent; the image is used unmasked."
-            )
+            names = summarize_names([entry["mask_path"]]), summarize_names([entry["file_path"]])
+            warnings.append(f"The mask {names[0]} of {names[1]} is absent; the image is used unmasked.")
             mask = None
     elif (path.parent / "masks").is_dir():
         mask = find_mask(path.parent / "masks", _inside_images(entry["file_path"], image))
@@ -186,6 +185,8 @@ def _points(document: dict[str, Any], root: Path, warnings: list[str]) -> tuple[
         return None, None
     path = files.child(root, name)
     if not files.is_regular(path):
-        warnings.append(f"The points {name} (`ply_file_path`) are absent; the scene starts without them.")
+        warnings.append(
+            f"The points {summarize_names([name])} (`ply_file_path`) are absent; the scene starts without them."
+        )
         return None, None
     return read_points_ply(path)

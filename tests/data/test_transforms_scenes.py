@@ -145,6 +145,29 @@ def test_points_of_a_ply(tmp_path: Path, text: bool) -> None:
     assert points.rgb.tolist() == [[4, 5, 6], [255, 0, 1]]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("place", ["x", "red"])
+def test_a_signaling_nan_is_left_out_in_silence(tmp_path: Path, place: str) -> None:
+    rows = np.zeros(3, dtype=[(name, "f4") for name in ("x", "y", "z", "red", "green", "blue")])
+    rows["y"] = 1, 2, 3
+    rows[place].view(np.uint32)[1] = 0x7FA00000
+    nerfstudio(tmp_path, ply_file_path="cloud.ply")
+    PlyData([PlyElement.describe(rows, "vertex")]).write(tmp_path / "cloud.ply")
+    points = load_scene(tmp_path).points
+    assert points is not None
+    assert points.xyz[:, 1].tolist() == [1, 3]
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path", "ply_file_path"])
+def test_a_name_without_end_is_shortened_in_the_warning(tmp_path: Path, key: str) -> None:
+    document = read_document(nerfstudio(tmp_path))
+    (document if key == "ply_file_path" else document["frames"][0])[key] = "long " * 20_000
+    write_json(tmp_path, document)
+    (warning,) = load_scene(tmp_path).warnings
+    assert "long long" in warning
+    assert len(warning) < 500
+
+
 def test_paths_may_lead_elsewhere_but_only_to_files(tmp_path: Path) -> None:
     root = nerfstudio(tmp_path / "scene")
     save_image(tmp_path / "else" / "a.png", mode="RGB")
