@@ -183,6 +183,9 @@ class SparseConfig:
     """Upper bound on the bands."""
     symmetry: Literal["auto", "off"] = "auto"
     """Search for the mirror planes of an object with masks; a run learns from the mirror images of its photos too."""
+    inflate: Literal["auto", "off"] = "auto"
+    """Completion of an object that one photo with a mask shows: its silhouette is inflated to a body, and a run learns
+    from views of that body from other sides too."""
     steps_per_view: Count = 500
     """Largest number of steps per input view, since more overfit few views; 0 = no bound."""
 

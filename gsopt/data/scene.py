@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, UInt8
@@ -31,6 +32,12 @@ FARTHEST_POINT = 1e6
 others fall on one place."""
 
 
+class PixelStore(Protocol):
+    """The images of views, by row."""
+
+    def get(self, index: int) -> UInt8[Tensor, "H W C"]: ...
+
+
 @dataclass(frozen=True)
 class View:
     """One posed image. Its pixels are read on demand and cached by the store."""
@@ -39,7 +46,7 @@ class View:
     """Path of the image relative to the scene, with forward slashes."""
     camera: Cameras
     """One camera, undistorted, at the working resolution."""
-    store: ImageStore
+    store: PixelStore
     index: int
     """Its row in the store."""
     mirrored: bool = False
@@ -81,11 +88,18 @@ class Scene:
     """Subtracted from every source position; not zero only where coordinates were too large for float32."""
     mirrored: tuple[View, ...] = ()
     """Mirror images of the input views, where the object is symmetric."""
+    guessed: tuple[View, ...] = ()
+    """Views of the shape that a single photo suggests (gsopt/init/inflation.py)."""
+
+    @property
+    def observed(self) -> tuple[View, ...]:
+        """The views that count as evidence: the input views, then their mirror images."""
+        return self.train + self.mirrored
 
     @property
     def drawn(self) -> tuple[View, ...]:
-        """The views a training step draws from: the input views, then their mirror images."""
-        return self.train + self.mirrored
+        """The views a training step draws from: those that count as evidence, then guesses."""
+        return self.observed + self.guessed
 
     @property
     def extent(self) -> float:

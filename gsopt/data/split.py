@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gsopt.config.train import DataConfig
 from gsopt.data.posed_images import Dataset, PosedImage
 from gsopt.errors import UsageError
 from gsopt.geometry.farthest_points import farthest_points
+from gsopt.geometry.focus import AXIS_DAMPING, nearest_to_axes, up_direction
 
 HOLD_OUT_EVERY = 8
 """As Mip-NeRF 360 and 3DGS do."""
+TELLING_ELEVATION = 30.0
+"""Degrees."""
 
 
 def split(dataset: Dataset, config: DataConfig) -> tuple[list[PosedImage], list[PosedImage]]:
@@ -34,7 +41,17 @@ def _chosen(train: list[PosedImage], config: DataConfig, kind: str) -> list[Pose
             f"`--views` must be at most the {len(train)} input views there are, got {config.views}. Lower it."
         )
     centers = torch.stack([-frame.viewmat[:3, :3].T @ frame.viewmat[:3, 3] for frame in train])
+    if config.views == 1:
+        return [train[telling_view(centers, torch.stack([frame.viewmat for frame in train]))]]
     return [train[row] for row in sorted(farthest_points(centers, config.views))]
+
+
+def telling_view(centers: Float[Tensor, "N 3"], viewmats: Float[Tensor, "N 4 4"]) -> int:
+    """Row of the camera whose elevation above the focus is nearest to TELLING_ELEVATION: from there one photo shows
+    front, side and top of an object. Ties go to the lowest row."""
+    offsets = centers - nearest_to_axes(centers, viewmats[:, 2, :3], AXIS_DAMPING)
+    sines = (offsets @ up_direction(viewmats)) / offsets.norm(dim=1).clamp_min(1e-12)
+    return int((sines.clamp(-1, 1).asin() - math.radians(TELLING_ELEVATION)).abs().numpy().argmin())
 
 
 def _by_ids(train: list[PosedImage], ids: tuple[int, ...], kind: str) -> list[PosedImage]:

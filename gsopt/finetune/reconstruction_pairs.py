@@ -148,7 +148,7 @@ def render_pairs(gaussians: Gaussians, scene: Scene, views: Sequence[View], size
     cameras = references.cameras
     depths = torch.stack([depth_in(gaussians, cameras[k], backend) for k in range(len(cameras))])
     references = replace(references, depths=depths)
-    u = coverage.uncertainty(coverage.coverage(gaussians, [view.camera for view in scene.drawn], backend))
+    u = coverage.uncertainty(coverage.coverage(gaussians, [view.camera for view in scene.observed], backend))
     truths = square_views(views, size, BLACK)
     rows = [_rendered(gaussians, u, view, references, size, backend) for view in views]
     renders, uncertainties, warped = (torch.stack(column) for column in zip(*rows, strict=True))

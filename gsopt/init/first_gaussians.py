@@ -85,9 +85,10 @@ def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Genera
     if found is None:
         return None
     gaussians = gaussians_at(found.xyz, found.rgb, sh_degree)
+    shape = "inflated silhouette" if found.silhouettes == 1 else f"visual hull of {found.silhouettes} silhouettes"
     return (
         gaussians,
-        f"visual hull of {found.silhouettes} silhouettes, {len(gaussians):,} points, voxel {found.voxel:.3g}",
+        f"{shape}, {len(gaussians):,} points, voxel {found.voxel:.3g}",
     )
 
 

@@ -2,7 +2,8 @@
 
 Carved on voxels, coarse to fine, then sampled: points are placed at random in the voxels and kept where every
 silhouette holds them, so a point's accuracy is that of the masks and not of the voxels (GaussianObject, Yang et al.
-2024, starts from such points). With few silhouettes only the round part of the hull is filled (`rounded`).
+2024, starts from such points). With few silhouettes only the round part of the hull is filled (`rounded`),
+and a single one is inflated (gsopt/init/inflation.py).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import Focus, find_focus
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated, eroded
+from gsopt.init.inflation import inflated
 from gsopt.init.rounded_hull import rounded
 from gsopt.init.surface_colors import unoccluded_colors
 from gsopt.init.thumbnails import Thumbnail, sample, small_photos
@@ -57,14 +59,17 @@ class HullPoints:
 
 def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoints | None:
     """`count` colored points on and in the hull of the input views, or None for silhouettes that enclose nothing."""
-    photos = small_photos(scene.drawn, MAX_PHOTOS)
+    photos = small_photos(scene.observed, MAX_PHOTOS)
     covered = sum(float((photo.planes[3] > 127).double().mean()) for photo in photos) / len(photos)
     if covered > _FULL_COVERAGE:
         return None
-    grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
+    if len(photos) == 1:
+        grid = inflated(photos[0], scene.extent)
+    else:
+        grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
     if grid is None:
         return None
-    if len(photos) < UNROUNDED_FROM:
+    if 1 < len(photos) < UNROUNDED_FROM:
         cells = rounded(grid.occupied, grid.centers(grid.occupied), grid.voxel, photos)
         grid = replace(grid, occupied=cells)
     xyz = _sample_points(grid, photos, count, generator)

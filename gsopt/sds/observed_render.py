@@ -38,7 +38,7 @@ class Observer:
 
     def __init__(self, scene: Scene, backend: Backend, prior: Prior, plan: GuidancePlan, front: Cameras) -> None:
         self.backend = backend
-        self.inputs = [view.camera for view in scene.drawn]
+        self.inputs = [view.camera for view in scene.observed]
         self.cameras = guidance_cameras(self.inputs, scene.extent, prior.size, front)
         self.references = square_views(scene.train, prior.size, plan.background.fixed())
         self._count = plan.references

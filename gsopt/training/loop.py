@@ -19,6 +19,7 @@ from gsopt.events import to_json, write_atomic
 from gsopt.formats import save_splats
 from gsopt.gaussians import Gaussians
 from gsopt.init import first_gaussians
+from gsopt.init.guessed_views import with_guessed_views
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
@@ -27,13 +28,15 @@ from gsopt.training.guided.session import RunGuidance
 from gsopt.training.guided.start import start_guidance
 from gsopt.training.interrupt import StopRequest
 from gsopt.training.mirror_images import with_recorded_mirrors
-from gsopt.training.plan import RunPlan
+from gsopt.training.plan import RunPlan, guesses
 from gsopt.training.run_directory import Listener, RunDirectory, opened
 from gsopt.training.trainer import Trainer
 
 PROGRESS_SECONDS = 0.5
 # Steps between two checks that every parameter is finite; the loss is checked in every step.
 FINITE_EVERY = 100
+# Photos up to which a run warns about what they leave open.
+MAX_FEW_PHOTOS = 3
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,8 @@ def train(
             backend = make_backend(config.backend, config.threads)
             scene = load_scene(config.data)
             scene = with_recorded_mirrors(config, scene, directory)
+            if guesses(config, len(scene.train)):
+                scene = with_guessed_views(scene, backend)
             plan = RunPlan.of(config, scene)
             guidance = start_guidance(config, plan, scene, backend, directory)
             trainer, clock = _start(plan, scene, backend, directory, guidance, began)
@@ -181,13 +186,31 @@ def _start(
         train_views=len(names),
         test_views=len(scene.test),
         mirrors=len(scene.mirrored) // len(names),
+        guessed=len(scene.guessed),
         sparse=plan.sparse,
         guidance=directory.recorded("guidance"),
         setup_cpu_seconds=round(time.process_time() - began, 3),
     )
-    for warning in scene.warnings:
+    for warning in scene.warnings + few_photo_warnings(scene):
         directory.warn(warning)
     return trainer, Clock(trainer.step, *spent)
+
+
+def few_photo_warnings(scene: Scene) -> tuple[str, ...]:
+    """Tells users of one to three photos what the photos leave open."""
+    if len(scene.train) > MAX_FEW_PHOTOS:
+        return ()
+    if not scene.has_alpha:
+        return (
+            f"{len(scene.train)} input views without masks: sides that they do not show cannot be completed. Add alpha "
+            "or a folder masks/ (docs/howto/photos.md), or more photos.",
+        )
+    if scene.guessed:
+        return (
+            "One photo shows one side: depth and the other sides are a guess, the silhouette inflated to a body in the "
+            "photo's colors. A second photo from the side helps most.",
+        )
+    return ()
 
 
 def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:

@@ -73,8 +73,8 @@ class RunPlan:
     density: DensityPlan
     poses: PoseConfig
     guidance: GuidancePlans
-    mirrored_per_epoch: int
-    """Number of mirror images drawn beside every input view once."""
+    extra_per_epoch: int
+    """Number of mirror images or guessed views drawn beside every input view once."""
     target_cache_mb: float
     stop_when_flat: bool
     crop_masked: bool
@@ -89,7 +89,7 @@ class RunPlan:
         """Resolves the settings against a scene, mirror images included."""
         views = len(scene.train)
         sparse = is_sparse(config.sparse, views)
-        iterations = shortened(config, views)
+        iterations = shortened(config, 2 * views if scene.guessed else views)
         background = Background.of(config.data)
         budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), iterations)
         schedule = make_schedule(config, iterations, sparse, scene.extent)
@@ -104,7 +104,7 @@ class RunPlan:
             density=density_plan(config.density, budget, scene.extent),
             poses=config.poses,
             guidance=GuidancePlans.of(config.guidance, iterations, config.seed, background),
-            mirrored_per_epoch=mirrored_per_epoch(views, len(scene.mirrored)),
+            extra_per_epoch=extra_per_epoch(scene),
             target_cache_mb=TARGET_CACHE_SHARE * config.data.cache_mb,
             stop_when_flat=config.schedule.stop_when_flat,
             crop_masked=config.schedule.crop_masked,
@@ -122,6 +122,11 @@ class RunPlan:
 def is_sparse(config: SparseConfig, views: int) -> bool:
     """True when the regularizers for few views are on."""
     return views <= config.below_views
+
+
+def guesses(config: TrainConfig, views: int) -> bool:
+    """True when a single photo is completed by views of its inflated silhouette."""
+    return config.sparse.inflate == "auto" and is_sparse(config.sparse, views) and not config.poses.refine
 
 
 def shortened(config: TrainConfig, views: int) -> int:
@@ -204,6 +209,7 @@ def default_budget(pixels: float, iterations: int) -> int:
     return min(max(wanted, MIN_BUDGET), MAX_BUDGET)
 
 
-def mirrored_per_epoch(views: int, images: int) -> int:
-    """Number of mirror images drawn beside every input view once."""
-    return min(images, round(MIRRORED_TIMES_VIEWS / views))
+def extra_per_epoch(scene: Scene) -> int:
+    """Number of mirror images or guessed views drawn beside every input view once: as many guesses as photos."""
+    views = len(scene.train)
+    return views if scene.guessed else min(len(scene.mirrored), round(MIRRORED_TIMES_VIEWS / views))

@@ -59,9 +59,9 @@ class Trainer:
         self._last = plan.schedule.iterations
         self.poses = PoseRefinement(plan.poses, scene, self._last) if plan.poses.refine else None
         self._generators = generators(plan.seed)
-        views, images = len(scene.train), len(scene.mirrored)
-        self._order = ViewOrder(views, self._generators["views"], images, plan.mirrored_per_epoch)
-        self._flatness = Flatness.of(views + plan.mirrored_per_epoch)
+        views, images = len(scene.train), len(scene.drawn) - len(scene.train)
+        self._order = ViewOrder(views, self._generators["views"], images, plan.extra_per_epoch)
+        self._flatness = Flatness.of(views + plan.extra_per_epoch)
         self._resting = Resting(views + images)
         self._bands = Bands(plan.schedule.optimizer.sh_degree_every, plan.schedule.max_sh_degree)
         self._targets = Targets(scene.drawn, plan.background.constant(), int(plan.target_cache_mb * 1e6))

@@ -13,6 +13,7 @@ from PIL import Image
 
 from gsopt.config.train import DataConfig
 from gsopt.data.colmap import read_colmap
+from gsopt.data.images import ImageStore
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm.masks import FeatureInput
@@ -112,6 +113,7 @@ def _write_undistorted(pycolmap: ModuleType, reconstruction: Any, found: Path, s
 
 def _write_view(view: View, found: Path, scene: Path, name: str) -> str:
     """Writes one photo and returns its name, which ends in .png where there is alpha."""
+    assert isinstance(view.store, ImageStore)  # the scene was just loaded: its views are files
     stored = view.store.sources[view.index]
     if stored.undistortion is None and stored.mask is None:
         shutil.copyfile(found / "images" / name, scene / "images" / name)

@@ -1,0 +1,97 @@
+"""Views of the shape that one photo suggests, from where nobody photographed it: the rest of the object, as a guess."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gsopt.data.scene import Scene, View
+from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras, look_at
+from gsopt.geometry.sh import sh0_from_rgb
+from gsopt.geometry.voxels import Grid
+from gsopt.init.inflation import inflated, object_box, world_up
+from gsopt.init.surface_colors import unoccluded_colors
+from gsopt.init.thumbnails import Thumbnail, small_photos
+from gsopt.raster.backend import Backend, RasterSettings
+
+COUNT = 16
+"""Number of guessed views."""
+HEIGHTS = (-0.1, 0.95)
+"""Sines of the lowest and highest elevation of their cameras."""
+COLOR_WEIGHT = 0.3
+"""Weight of their colors in the loss, beside 1 for the photo; at 0 the unseen sides show streaks of background."""
+SPLAT_SCALE = 0.6
+"""Standard deviation of the splats that draw the voxels, voxels."""
+OPAQUE_LOGIT = 6.0
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+@dataclass(frozen=True)
+class DrawnImages:
+    """Images that were drawn and not read: a store of views."""
+
+    pixels: UInt8[Tensor, "C H W 4"]
+
+    def get(self, index: int) -> UInt8[Tensor, "H W 4"]:
+        return self.pixels[index]
+
+
+def with_guessed_views(scene: Scene, backend: Backend) -> Scene:
+    """The scene with guessed views where it has one input view, with alpha; any other scene as it is."""
+    if len(scene.train) != 1 or not scene.has_alpha:
+        return scene
+    photo = small_photos(scene.train, 1)[0]
+    grid = inflated(photo, scene.extent)
+    if grid is None:
+        return scene
+    cameras = surrounding_cameras(photo, scene.extent)
+    store = DrawnImages(drawn_voxels(grid, photo, cameras, backend))
+    views = [View(f"guess_{i:02d}", cameras[i], store, i, color=COLOR_WEIGHT) for i in range(COUNT)]
+    return replace(scene, guessed=tuple(views))
+
+
+def surrounding_cameras(photo: Thumbnail, extent: float) -> Cameras:
+    """Cameras on a spiral around the object (Fibonacci), at the photo's distance, with its lens and size."""
+    middle, _ = object_box(photo.camera, photo.alpha()[0] > 0.5, extent)
+    distance = float((photo.camera.centers[0] - middle).norm())
+    number = torch.arange(COUNT) + 0.5
+    height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * number / COUNT
+    angle, level = number * GOLDEN_ANGLE, (1 - height**2).sqrt()
+    up = world_up(photo.camera)
+    ahead = torch.linalg.cross(up, photo.camera.viewmats[0, 0, :3])
+    ahead = ahead / ahead.norm()
+    aside = torch.linalg.cross(up, ahead)
+    offsets = (level * angle.cos())[:, None] * ahead + (level * angle.sin())[:, None] * aside + height[:, None] * up
+    viewmats = look_at(middle + distance * offsets, middle, up).to(photo.camera.viewmats)
+    return replace(photo.camera, viewmats=viewmats, Ks=photo.camera.Ks.repeat(COUNT, 1, 1))
+
+
+def drawn_voxels(grid: Grid, photo: Thumbnail, cameras: Cameras, backend: Backend) -> UInt8[Tensor, "C H W 4"]:
+    """The shape in the photo's colors, which go straight through it: straight sRGB color and alpha."""
+    points = grid.surface()
+    gaussians = voxel_gaussians(points, unoccluded_colors(grid, [photo], points), SPLAT_SCALE * grid.voxel)
+    settings, black = RasterSettings(sh_degree=0), torch.zeros(3)
+    images = []
+    for index in range(len(cameras)):
+        frame = backend.forward(gaussians, cameras[index], settings, black)
+        color = frame.colors / frame.alphas.clamp_min(1e-6)[..., None]
+        images.append(torch.cat([color, frame.alphas[..., None]], dim=-1))
+    return (torch.stack(images).clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def voxel_gaussians(points: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], scale: float) -> Gaussians:
+    """Opaque balls."""
+    count = len(points)
+    return Gaussians(
+        means=points,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.full((count, 3), math.log(scale)),
+        logit_opacities=torch.full((count,), OPAQUE_LOGIT),
+        sh0=sh0_from_rgb(rgb)[:, None],
+        shN=torch.zeros(count, 0, 3),
+    )
