@@ -57,7 +57,7 @@ def with_guessed_views(scene: Scene, backend: Backend) -> Scene:
 
 def surrounding_cameras(photo: Thumbnail, extent: float) -> Cameras:
     """Cameras on a spiral around the object (Fibonacci), at the photo's distance, with its lens and size."""
-    middle, _ = object_box(photo.camera, photo.alpha()[0] > 0.5, extent)
+    middle, _, _ = object_box(photo.camera, photo.alpha()[0] > 0.5, extent)
     distance = float((photo.camera.centers[0] - middle).norm())
     number = torch.arange(COUNT) + 0.5
     height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * number / COUNT

@@ -3,11 +3,11 @@
 One silhouette leaves an endless cone open. With d(x) the distance of a voxel's pixel to the outline and w(x) the radius
 of the largest disk in the silhouette that holds this pixel, both in scene units at the voxel's depth,
 
-    (1)  keep x where  |n . (x - c)| |n . a| <= h(x),    h(x) = sqrt(d (2 w - d)),
+    (1)  keep x where  |n . (x - c)| <= h(x),    h(x) = sqrt(d (2 w - d)),
 
-where c is the middle of the object, a the camera's axis and n the normal of a plane through c. A tube of radius w gets
-a round cross-section. The plane is upright and faces the camera, because things stand on the ground: the legs of a
-chair lie below its seat, not nearer to the camera. From steeply above the plane is level.
+where c is the middle of the object and n the normal of a plane through c. An upright tube of radius w gets a round
+cross-section. The plane is upright and faces the camera, because things stand on the ground: the legs of a chair lie
+below its seat, not nearer to the camera. From steeply above the plane is level. A ball around c that the photo just frames bounds the body.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def inflated(photo: Thumbnail, extent: float) -> Grid | None:
     solid = photo.alpha()[0] > 0.5
     if not bool(solid.any()):
         return None
-    middle, half = object_box(photo.camera, solid, extent)
+    middle, half, frame = object_box(photo.camera, solid, extent)
     grid = Grid(torch.ones(SIDE, SIDE, SIDE, dtype=torch.bool), middle - half, 2 * half / SIDE)
     points = grid.centers()
     column, row, depth = project(photo.camera, points)
@@ -49,10 +49,10 @@ def inflated(photo: Thumbnail, extent: float) -> Grid | None:
     distances = torch.stack(silhouette_distances(solid))
     column, row = column[rows], row[rows]
     inset, width = sample(distances, column, row) * (depth[rows] / float(photo.camera.Ks[0, 0, 0]))
-    cone = sample(photo.alpha(), column, row)[0] > 0.5
+    framed = (points[rows] - middle).norm(dim=1) <= frame
+    cone = framed & (sample(photo.alpha(), column, row)[0] > 0.5)
     rows, column, row, inset, width = (values[cone] for values in (rows, column, row, inset, width))
-    axis, normal = photo.camera.forwards[0], plane_normal(photo.camera)
-    away = ((points[rows] - middle) @ normal).abs() * float((normal @ axis).abs())
+    away = ((points[rows] - middle) @ plane_normal(photo.camera)).abs()
     kept = away <= (inset * (2 * width - inset)).clamp_min(0).sqrt()
     step = math.ceil(grid.voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth[rows].median()))
     block = (row / step).long() * (solid.shape[1] // step + 1) + (column / step).long()
@@ -70,15 +70,16 @@ def _missing(kept: Bool[Tensor, "M"], block: Int[Tensor, "M"], away: Float[Tenso
     return ~filled[block] & (away <= nearest[block] + voxel / 2) & (away <= 2 * voxel)
 
 
-def object_box(camera: Cameras, solid: Bool[Tensor, "H W"], extent: float) -> tuple[Float[Tensor, "3"], float]:
-    """The middle of the object, as far away as the cameras' focus, and half the side of a cube that holds it."""
+def object_box(camera: Cameras, solid: Bool[Tensor, "H W"], extent: float) -> tuple[Float[Tensor, "3"], float, float]:
+    """The middle of the object, as far away as the camera's focus, half the side of a cube that holds it, and the
+    radius of the ball that the photo frames there: photographers leave objects room on all sides."""
     rows, columns = (torch.nonzero(solid.any(dim=axis))[:, 0] for axis in (1, 0))
     low, high = torch.stack([columns[0], rows[0]]), torch.stack([columns[-1], rows[-1]]) + 1
     focus, K = find_focus([camera], extent), camera.Ks[0]
     depth = float((focus.point - camera.centers[0]) @ camera.forwards[0])
     ray = torch.cat([((low + high) / 2 - K[:2, 2]) / K.diagonal()[:2], torch.ones(1)])
     half = MARGIN * depth * float(((high - low) / 2 / K.diagonal()[:2]).norm())
-    return camera.centers[0] + camera.viewmats[0, :3, :3].T @ ray * depth, half
+    return camera.centers[0] + camera.viewmats[0, :3, :3].T @ ray * depth, half, focus.radius
 
 
 def plane_normal(camera: Cameras) -> Float[Tensor, "3"]:

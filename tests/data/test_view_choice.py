@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from dataset_builders import nerf_synthetic, nerfstudio, read_document, write_json
 
 from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
+from gsopt.data.split import telling_view
 from gsopt.errors import InputError, UsageError
+from gsopt.geometry.cameras import look_at
 
 
 def names(root: Path, **settings: object) -> list[str]:
@@ -74,3 +77,12 @@ def test_the_test_views_stay_whatever_is_chosen(tmp_path: Path) -> None:
     for settings in ({}, {"views": 2}, {"view_ids": (1,)}, {"eval": True}):
         scene = load_scene(DataConfig(path=str(root), **settings))  # type: ignore[arg-type]
         assert [view.name for view in scene.test] == [f"test/r_{i}.png" for i in range(3)]
+
+
+def test_one_view_is_taken_from_thirty_degrees_up_and_not_from_the_top() -> None:
+    degrees = torch.tensor([80.0, 55.0, 33.0, 10.0, -20.0], dtype=torch.float64).deg2rad()
+    azimuth = torch.arange(5, dtype=torch.float64)
+    eyes = torch.stack([degrees.cos() * azimuth.cos(), degrees.cos() * azimuth.sin(), degrees.sin()], dim=1) * 3
+    viewmats = look_at(eyes, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1], dtype=torch.float64))
+    assert telling_view(eyes, viewmats) == 2
+    assert telling_view(eyes[:1], viewmats[:1]) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -166,4 +167,5 @@ def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
     ("views", "images", "drawn"), [(4, 4, 4), (4, 24, 8), (8, 8, 4), (8, 48, 4), (16, 16, 2), (5, 0, 0)]
 )
 def test_the_more_photos_the_fewer_mirror_images(views: int, images: int, drawn: int) -> None:
-    assert plan.mirrored_per_epoch(views, images) == drawn
+    scene = SimpleNamespace(train=(None,) * views, mirrored=(None,) * images, guessed=())
+    assert plan.extra_per_epoch(scene) == drawn  # type: ignore[arg-type]
