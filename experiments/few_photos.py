@@ -61,10 +61,7 @@ def run(scene: Path, seed: int, arm: str) -> dict[str, Any]:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """A row per object, seeds averaged, and the paired mean."""
-    lines = [
-        "| object | photo alone, dB | inflated, dB | LPIPS | difference, dB | worst seed |",
-        "|---|---|---|---|---|---|",
-    ]
+    lines = ["| object | photo alone, dB | inflated, dB | LPIPS | difference, dB | worst seed |", "|---" * 6 + "|"]
     gains = []
     for name in sorted({one["scene"] for one in runs}):
         pairs = {arm: {o["seed"]: o for o in runs if o["scene"] == name and o["arm"] == arm} for arm in ARMS}

@@ -7,7 +7,8 @@ of the largest disk in the silhouette that holds this pixel, both in scene units
 
 where c is the middle of the object and n the normal of a plane through c. An upright tube of radius w gets a round
 cross-section. The plane is upright and faces the camera, because things stand on the ground: the legs of a chair lie
-below its seat, not nearer to the camera. From steeply above the plane is level. A ball around c that the photo just frames bounds the body.
+below its seat, not nearer to the camera. From steeply above the plane is level. A ball around c that the photo just
+frames bounds the body.
 """
 
 from __future__ import annotations

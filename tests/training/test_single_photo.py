@@ -51,11 +51,10 @@ def test_what_one_photo_does_not_show_is_completed(one_photo: Path, tmp_path: Pa
     assert len(completed.scene.guessed) > 0
     assert photo_alone.scene.guessed == ()
     assert held_out_psnr(completed) > held_out_psnr(photo_alone) + 1
-    started = next(event for event in read_events(tmp_path / "on" / "events.jsonl") if event["kind"] == "started")
+    events, _ = read_events(tmp_path / "on" / "events.jsonl")
+    started = next(event for event in events if event["kind"] == "started")
     assert started["guessed"] == len(completed.scene.guessed)
-    warnings = [
-        event["message"] for event in read_events(tmp_path / "on" / "events.jsonl") if event["kind"] == "warning"
-    ]
+    warnings = [event["message"] for event in events if event["kind"] == "warning"]
     assert any("a guess" in message for message in warnings)
 
 
