@@ -35,6 +35,27 @@ def test_a_named_interpreter_needs_no_consent(tmp_path: Path) -> None:
             interpreter.find(wrong, (), tmp_path / "project", {})
 
 
+def test_only_an_absolute_path_of_a_program_is_an_interpreter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    python = make_venv(tmp_path, tmp_path / "run")
+    monkeypatch.chdir(python.parent)
+    with pytest.raises(UsageError, match="not there"):
+        interpreter.find(python.name, (), None, {})
+    python.chmod(0o644)
+    if sys.platform != "win32":
+        with pytest.raises(UsageError, match="not a program"):
+            interpreter.find(str(python), (), None, {})
+
+
+def test_a_python_is_found_beside_gsopt_or_what_gsopt_links_to(tmp_path: Path) -> None:
+    python = make_venv(tmp_path, tmp_path / "run")
+    script = python.with_name(interpreter.console_script())
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / script.name).symlink_to(script)
+    assert interpreter.candidates(None, {"PATH": str(tmp_path / "bin")}) == [python]
+    script.unlink()
+    assert interpreter.candidates(tmp_path, {"PATH": ""}) == []
+
+
 def test_a_found_interpreter_is_used_once_it_is_allowed(tmp_path: Path) -> None:
     python, other = (make_venv(tmp_path / name, tmp_path / "run") for name in ("project", "other"))
     path = {"PATH": str(other.parent)}

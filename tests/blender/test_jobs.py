@@ -124,6 +124,15 @@ def test_a_record_from_before_a_restart_names_no_process(tmp_path: Path, monkeyp
     wait(running)
 
 
+def test_where_no_process_can_be_identified_only_children_live(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job, "identity", lambda pid: "")
+    running = job.start("train", [sys.executable, "-c", "import time; time.sleep(60)"], tmp_path / "job")
+    assert job.alive(running)
+    assert not job.alive(replace(running, pid=os.getpid()))
+    job.end(running, force=True)
+    wait(running)
+
+
 def test_what_no_record_can_hold_is_an_error_of_ours(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="No JSON file can hold"):
         job.start("train", [sys.executable, "-c", "", "\udcff"], tmp_path)

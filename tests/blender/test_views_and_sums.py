@@ -62,6 +62,10 @@ def test_the_center_of_every_lens_of_colmap_is_read(tmp_path: Path, model: int, 
     (sparse / "images.bin").write_bytes(struct.pack("<Q", 1) + image)
     (view,) = read_views(tmp_path)
     assert view.center == (90.0, 55.0)
+    bad = struct.pack(f"<iiQQ{len(padded)}d", 2, model, 200, 100, values[0], *[math.nan] * (len(padded) - 1))
+    (sparse / "cameras.bin").write_bytes(struct.pack("<Q", 1) + bad)
+    with pytest.raises(InputError, match="no usable lens"):
+        read_views(tmp_path)
     assert view.angle_x == pytest.approx(math.pi / 2)
 
 
