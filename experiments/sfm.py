@@ -111,10 +111,11 @@ def find_features(pycolmap: Any, options: argparse.Namespace) -> dict[str, Any]:
     inputs = masks(options, read)
     database = options.work / "database.db"
     chosen = time.process_time()
-    features.extract(pycolmap, database, read, inputs, config)
+    project = features.ColmapProject(pycolmap, database, inputs.photos, config)
+    features.extract(project, read, inputs.masks)
     extracted = time.process_time()
     matching = features.choose_matching(config, len(read), options.video)
-    graph = features.match(pycolmap, database, [photo.name for photo in read], matching, config, print)
+    graph = features.match(project, [photo.name for photo in read], matching, print)
     return {
         "photos": len(read),
         "masks": inputs.kind,
@@ -143,8 +144,9 @@ def find_poses(pycolmap: Any, options: argparse.Namespace, mapper: str) -> dict[
             (work / name).symlink_to((options.work / name).absolute())
     config = SfmConfig(mapper=mapper, threads=1)  # type: ignore[arg-type]
     opaque = work / "opaque" if (work / "opaque").exists() else work / "photos"
-    graph = features.read_graph(pycolmap, work / "database.db")
-    mapped = mapping.find_poses(pycolmap, work / "database.db", opaque, graph, config, print)
+    project = features.ColmapProject(pycolmap, work / "database.db", opaque, config)
+    graph = features.read_graph(project)
+    mapped = mapping.find_poses(project, graph, print)
     if mapped is None:
         return {"registered": 0}
     found = mapped.reconstruction

@@ -16,14 +16,7 @@ from gsopt.benchmark.surface_scene import surface_scene
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import make_backend
-from gsopt.raster.backend import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    TRANSMITTANCE_MIN,
-    Backend,
-    Gradients,
-    RasterSettings,
-)
+from gsopt.raster.backend import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Backend, Gradients, RasterSettings
 from gsopt.raster.cpu_backend import ISA_VARIABLE
 from gsopt.raster.reference import hard_threshold, raw_alphas, splat, transmittances
 

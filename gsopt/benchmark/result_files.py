@@ -27,7 +27,7 @@ def parsed(path: Path) -> dict[str, Any]:
         document = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read as JSON ({error}). Remove it, or name another file.") from error
-    schema.require_object(document, path.name)
+    schema.require(document, dict, path.name)
     found: dict[str, Any] = document
     return found
 

@@ -98,11 +98,6 @@ def require(value: Any, schema: Schema, where: str = "result") -> None:
             raise _mismatch(where, " or ".join(_name(option) for option in options), value)
 
 
-def require_object(value: Any, where: str) -> None:
-    """Raise InputError unless `value` is a JSON object."""
-    _require_type(value, dict, where)
-
-
 def _fits(value: Any, kind: Any) -> bool:
     if kind is None:
         return value is None

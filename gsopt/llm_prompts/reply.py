@@ -145,18 +145,14 @@ def _entries(document: dict[str, Any], slots: Mapping[str, int], problems: list[
 def validated(row: Any) -> Entry | str:
     """Returns an entry of the schema, or its error."""
     pydantic = require("pydantic", "llm", "Checking a language model's reply")
+    from gsopt.llm_prompts.reply_model import EntryModel
+
     values = {"text": row} if isinstance(row, str) else row
     try:
-        return cast(Entry, _entry_model().model_validate(values))
+        return cast(Entry, EntryModel.model_validate(values))
     except pydantic.ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         return f"`{'.'.join(map(str, first['loc'])) or 'entry'}`: {first['msg']}"
-
-
-def _entry_model() -> Any:
-    from gsopt.llm_prompts.reply_model import EntryModel
-
-    return EntryModel
 
 
 def _prompt(slot: str, entry: Entry, spec: PromptSpec, source: str, counter: TokenCounter) -> Prompt:

@@ -16,7 +16,7 @@ from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
-from gsopt.formats import save_splats
+from gsopt.formats.ply import save_ply
 from gsopt.gaussians import Gaussians
 from gsopt.init import first_gaussians
 from gsopt.init.guessed_views import with_guessed_views
@@ -154,12 +154,7 @@ class Clock:
 
 
 def _start(
-    plan: RunPlan,
-    scene: Scene,
-    backend: Backend,
-    directory: RunDirectory,
-    guidance: RunGuidance | None,
-    began: float,
+    plan: RunPlan, scene: Scene, backend: Backend, directory: RunDirectory, guidance: RunGuidance | None, began: float
 ) -> tuple[Trainer, Clock]:
     """A trainer at step 0 or at the newest checkpoint, and the time already spent. `began`: in CPU seconds."""
     names = [view.name for view in scene.train]
@@ -239,7 +234,7 @@ def is_due(step: int, every: int) -> bool:
 def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
     _save(trainer, directory, clock)
-    save_splats(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.plan.antialiased)
+    save_ply(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.plan.antialiased)
     if trainer.poses is not None:
         write_atomic(directory.path / "poses.json", to_json(trainer.poses.record(trainer.scene.origin)))
 
@@ -255,7 +250,7 @@ def _preview(trainer: Trainer, directory: RunDirectory) -> None:
     """The splats so far: written, closed, then announced."""
     _check_finite(trainer, directory)
     path = directory.previews / f"step_{trainer.step:06d}.ply"
-    save_splats(path, trainer.model.gaussians, antialiased=trainer.plan.antialiased)
+    save_ply(path, trainer.model.gaussians, antialiased=trainer.plan.antialiased)
     directory.emit("preview", step=trainer.step, path=path.relative_to(directory.path).as_posix())
 
 

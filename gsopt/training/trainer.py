@@ -40,12 +40,7 @@ class Trainer:
     """Owns the model, its density control and all random numbers of one run."""
 
     def __init__(
-        self,
-        plan: RunPlan,
-        scene: Scene,
-        gaussians: Gaussians,
-        backend: Backend,
-        guidance: RunGuidance | None = None,
+        self, plan: RunPlan, scene: Scene, gaussians: Gaussians, backend: Backend, guidance: RunGuidance | None = None
     ) -> None:
         """`guidance` None: learn from the input views alone."""
         self.plan = plan
@@ -208,11 +203,7 @@ class Trainer:
 
     @staticmethod
     def resumed(
-        plan: RunPlan,
-        scene: Scene,
-        backend: Backend,
-        checkpoint: Checkpoint,
-        guidance: RunGuidance | None = None,
+        plan: RunPlan, scene: Scene, backend: Backend, checkpoint: Checkpoint, guidance: RunGuidance | None = None
     ) -> Trainer:
         """A trainer as it was when the checkpoint was written; InputError when that belongs to another run."""
         try:

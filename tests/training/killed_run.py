@@ -45,7 +45,7 @@ MOMENTS = {
     "while config.json is completed": lambda: before(os, "replace", 2),
     "in the middle of a step": lambda: before(trainer.Trainer, "_update", 17),
     "between writing a checkpoint and renaming it": lambda: before(os, "replace", 5),
-    "between the last checkpoint and the splats": lambda: before(loop, "save_splats", 3),
+    "between the last checkpoint and the splats": lambda: before(loop, "save_ply", 3),
 }
 
 if __name__ == "__main__":

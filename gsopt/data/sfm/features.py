@@ -9,7 +9,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.photos import Photo
 from gsopt.data.sfm.retrieval import similar_pairs
 from gsopt.data.sfm.settings import SfmConfig
@@ -26,6 +25,20 @@ LOOP_PARTNERS, SIMILAR_PARTNERS = 5, 30
 """Similar photos that each photo is compared with: to close loops of a video, and instead of all others."""
 _PAIRS_PER_BATCH = 400
 """Pairs between two lines of progress."""
+
+
+@dataclass(frozen=True)
+class ColmapProject:
+    """COLMAP at work on one set of photos."""
+
+    pycolmap: ModuleType
+    database: Path
+    photos: Path
+    """Folder of the images that features are read from."""
+    config: SfmConfig
+
+    def opened(self) -> Any:
+        return self.pycolmap.Database.open(self.database)
 
 
 @dataclass(frozen=True)
@@ -58,25 +71,24 @@ class ViewGraph:
         return sorted(distinct, key=lambda members: (-len(members), min(members)))
 
 
-def extract(
-    pycolmap: ModuleType, database: Path, photos: Sequence[Photo], inputs: FeatureInput, config: SfmConfig
-) -> None:
+def extract(project: ColmapProject, photos: Sequence[Photo], masks: Path | None) -> None:
     """Features of all photos, one camera for each lens, zoom and size."""
-    pycolmap.Database.open(database).close()  # makes it
+    pycolmap, database, config = project.pycolmap, project.database, project.config
+    project.opened().close()  # makes it
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = config.threads or -1
     options.max_image_size = config.max_size
     options.sift.max_num_features = config.features
     for shared in cameras(photos):
         reader = reader_options(pycolmap, shared, config)
-        if inputs.masks is not None:
-            reader.mask_path = inputs.masks
+        if masks is not None:
+            reader.mask_path = masks
         names = [photo.name for photo in shared]
         # Listed first, in order: threads that finish in any order would number the photos in any order.
-        pycolmap.import_images(database, inputs.photos, pycolmap.CameraMode.SINGLE, names, reader)
+        pycolmap.import_images(database, project.photos, pycolmap.CameraMode.SINGLE, names, reader)
         pycolmap.extract_features(
             database,
-            inputs.photos,
+            project.photos,
             image_names=names,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
@@ -115,11 +127,10 @@ def choose_matching(config: SfmConfig, count: int, is_video: bool) -> str:
     return "exhaustive" if count <= EXHAUSTIVE_UP_TO else "retrieval"
 
 
-def match(
-    pycolmap: ModuleType, database: Path, names: Sequence[str], matching: str, config: SfmConfig, report: Report
-) -> ViewGraph:
+def match(project: ColmapProject, names: Sequence[str], matching: str, report: Report) -> ViewGraph:
     """Compare the photos that `matching` picks, verify each pair geometrically, and return the graph."""
-    pairs = pairs_to_match(pycolmap, database, names, matching, config.seed)
+    pycolmap, database, config = project.pycolmap, project.database, project.config
+    pairs = pairs_to_match(project, names, matching)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = config.threads or -1
     verification = pycolmap.TwoViewGeometryOptions()
@@ -133,18 +144,18 @@ def match(
             database, matching_options=options, pairing_options=pairing, verification_options=verification
         )
         report(f"compared {start + len(part):,} of {len(pairs):,} pairs of photos ({matching})")
-    return read_graph(pycolmap, database)
+    return read_graph(project)
 
 
-def pairs_to_match(pycolmap: ModuleType, database: Path, names: Sequence[str], matching: str, seed: int) -> list[Pair]:
+def pairs_to_match(project: ColmapProject, names: Sequence[str], matching: str) -> list[Pair]:
     """Pairs in an order that does not depend on how they were found."""
     if matching == "exhaustive":
         return list(itertools.combinations(names, 2))
     pairs = set(neighbors_in_time(names))
     if len(names) > NEIGHBORS_IN_TIME:
-        descriptors = read_descriptors(pycolmap, database, names)
+        descriptors = read_descriptors(project, names)
         most = LOOP_PARTNERS if matching == "sequential" else SIMILAR_PARTNERS
-        pairs |= {(names[i], names[j]) for i, j in similar_pairs(descriptors, most, seed)}
+        pairs |= {(names[i], names[j]) for i, j in similar_pairs(descriptors, most, project.config.seed)}
     rank = {name: position for position, name in enumerate(names)}
     return sorted(pairs, key=lambda pair: (rank[pair[0]], rank[pair[1]]))
 
@@ -155,20 +166,21 @@ def neighbors_in_time(names: Sequence[str]) -> Iterable[Pair]:
     return ((names[i], names[i + step]) for step in steps for i in range(len(names) - step))
 
 
-def read_descriptors(pycolmap: ModuleType, database: Path, names: Sequence[str]) -> list[Any]:
+def read_descriptors(project: ColmapProject, names: Sequence[str]) -> list[Any]:
     """SIFT descriptors of each photo, uint8 [F, 128]."""
-    with pycolmap.Database.open(database) as db:
+    with project.opened() as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         return [db.read_descriptors(ids[name]).data for name in names]
 
 
-def read_graph(pycolmap: ModuleType, database: Path) -> ViewGraph:
+def read_graph(project: ColmapProject) -> ViewGraph:
     """The graph stored in a database."""
+    pycolmap = project.pycolmap
     kinds = pycolmap.TwoViewGeometryConfiguration
     without_depth = {int(kinds.PANORAMIC), int(kinds.PLANAR_OR_PANORAMIC), int(kinds.PLANAR)}
     inliers: dict[Pair, int] = {}
     still: set[Pair] = set()
-    with pycolmap.Database.open(database) as db:
+    with project.opened() as db:
         names = {image.image_id: image.name for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(image_id) for image_id, name in names.items()}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):

@@ -4,40 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from gsopt.data.posed_images import PosedImage
+from gsopt.data.sfm.features import ColmapProject
 from gsopt.data.sfm.mapping import incremental_options
-from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import InputError
 
 
-def write_cameras(pycolmap: ModuleType, database: Path, frames: Sequence[PosedImage]) -> None:
+def write_cameras(project: ColmapProject, frames: Sequence[PosedImage]) -> None:
     """Put the known lens of each frame (by name) into the database, in place of the guess from EXIF."""
     known = {Path(frame.name).name: frame for frame in frames}
-    with pycolmap.Database.open(database) as db:
+    with project.opened() as db:
         cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
         for image in db.read_all_images():
             frame = known[image.name]
             camera = cameras[image.camera_id]
             model, params = lens_parameters(frame)
-            exact = pycolmap.Camera(
+            exact = project.pycolmap.Camera(
                 camera_id=camera.camera_id, model=model, width=frame.width, height=frame.height, params=params
             )
             exact.has_prior_focal_length = True
             db.update_camera(exact)
 
 
-def triangulate(
-    pycolmap: ModuleType, database: Path, photos: Path, frames: Sequence[PosedImage], config: SfmConfig
-) -> Any:
+def triangulate(project: ColmapProject, frames: Sequence[PosedImage]) -> Any:
     """A reconstruction with exactly the given poses and lenses, and the points their matches agree on."""
+    pycolmap = project.pycolmap
     known = {Path(frame.name).name: frame for frame in frames}
     reconstruction = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as db:
+    with project.opened() as db:
         for camera in db.read_all_cameras():
             reconstruction.add_camera_with_trivial_rig(camera)
         for image in db.read_all_images():
@@ -46,11 +44,11 @@ def triangulate(
                 pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
                 pycolmap.Rigid3d(np.ascontiguousarray(pose)),
             )
-    target = database.with_name("prior")
+    target = project.database.with_name("prior")
     target.mkdir()
-    pycolmap.set_random_seed(config.seed)
-    options = incremental_options(pycolmap, config)
-    return pycolmap.triangulate_points(reconstruction, database, photos, target, options=options)
+    pycolmap.set_random_seed(project.config.seed)
+    options = incremental_options(project)
+    return pycolmap.triangulate_points(reconstruction, project.database, project.photos, target, options=options)
 
 
 def lens_parameters(frame: PosedImage) -> tuple[str, list[float]]:

@@ -11,10 +11,9 @@ import shutil
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from gsopt.data.sfm.features import ViewGraph
+from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.events import Report
 
@@ -58,14 +57,12 @@ def registered(reconstruction: Any) -> set[str]:
     return {reconstruction.image(i).name for i in reconstruction.reg_image_ids()}
 
 
-def find_poses(
-    pycolmap: ModuleType, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig, report: Report
-) -> MappingResult | None:
+def find_poses(project: ColmapProject, graph: ViewGraph, report: Report) -> MappingResult | None:
     """The best reconstruction of the mappers that `config.mapper` allows, or None if no three photos fit together."""
     best: MappingResult | None = None
     count = len(graph.features)
-    for mapper in mappers_to_try(config, count):
-        models = run_mapper(pycolmap, mapper, database, photos, graph, config)
+    for mapper in mappers_to_try(project.config, count):
+        models = run_mapper(project, mapper, graph)
         if not models:
             report(f"{mapper} mapping placed no photo")
             continue
@@ -80,8 +77,8 @@ def find_poses(
     if best is None:
         return None
     if best.mapper != "incremental":
-        best = replace(best, reconstruction=_settled(pycolmap, best.reconstruction, database, photos, config))
-    best = replace(best, reconstruction=adjusted(pycolmap, best.reconstruction, config))
+        best = replace(best, reconstruction=_settled(project, best.reconstruction))
+    best = replace(best, reconstruction=adjusted(project, best.reconstruction))
     keep_coherent(best.reconstruction)
     return best if len(best.names) >= SMALLEST_MODEL else None
 
@@ -93,32 +90,27 @@ def mappers_to_try(config: SfmConfig, count: int) -> list[str]:
     return ["incremental", "hybrid"] if count <= INCREMENTAL_UP_TO else ["hybrid", "incremental"]
 
 
-def run_mapper(
-    pycolmap: ModuleType, mapper: str, database: Path, photos: Path, graph: ViewGraph, config: SfmConfig
-) -> list[Any]:
+def run_mapper(project: ColmapProject, mapper: str, graph: ViewGraph) -> list[Any]:
     """Reconstructions, the one with most photos first."""
-    pycolmap.set_random_seed(config.seed)
-    target = database.with_name(mapper)
+    project.pycolmap.set_random_seed(project.config.seed)
+    target = project.database.with_name(mapper)
     target.mkdir()
-    if mapper == "incremental":
-        models = _incremental(pycolmap, database, photos, target, config)
-    else:
-        models = _global(pycolmap, database, photos, target, graph, config)
+    models = _incremental(project, target) if mapper == "incremental" else _global(project, target, graph)
     for model in models:
         keep_coherent(model)
     if mapper == "hybrid" and models and len(registered(models[0])) < len(graph.features):
-        models = _repaired(pycolmap, models, database, photos, target, config)
+        models = _repaired(project, models, target)
     placed = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
     return sorted(placed, key=lambda model: (-model.num_reg_images(), min(registered(model))))
 
 
-def adjusted(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig) -> Any:
+def adjusted(project: ColmapProject, reconstruction: Any) -> Any:
     """The reconstruction after bundle adjustment; the principal point of a camera of many photos may move."""
     if reconstruction.num_reg_images() >= CENTER_FROM * len(reconstruction.cameras):
-        moved = _bundle_adjusted(pycolmap, reconstruction, config, center=True)
+        moved = _bundle_adjusted(project, reconstruction, center=True)
         if all(off_center(camera) <= MAX_OFF_CENTER for camera in moved.cameras.values()):
             return moved
-    return _bundle_adjusted(pycolmap, reconstruction, config, center=False)
+    return _bundle_adjusted(project, reconstruction, center=False)
 
 
 def off_center(camera: Any) -> float:
@@ -127,11 +119,12 @@ def off_center(camera: Any) -> float:
     return float(max(abs(x - 0.5), abs(y - 0.5)))
 
 
-def _bundle_adjusted(pycolmap: ModuleType, reconstruction: Any, config: SfmConfig, *, center: bool) -> Any:
+def _bundle_adjusted(project: ColmapProject, reconstruction: Any, *, center: bool) -> Any:
+    pycolmap = project.pycolmap
     reconstruction = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = config.focal is None
+    options.refine_focal_length = project.config.focal is None
     options.refine_principal_point = center
     options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
     options.ceres.solver_options.num_threads = 1
@@ -173,32 +166,30 @@ def covisible_groups(reconstruction: Any) -> list[set[int]]:
     return list({id(members): members for members in group.values()}.values())
 
 
-def incremental_options(pycolmap: ModuleType, config: SfmConfig) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
+def incremental_options(project: ColmapProject) -> Any:
+    options = project.pycolmap.IncrementalPipelineOptions()
     options.min_model_size = SMALLEST_MODEL
     options.num_threads = 1
-    options.random_seed = config.seed
-    options.ba_refine_focal_length = config.focal is None
+    options.random_seed = project.config.seed
+    options.ba_refine_focal_length = project.config.focal is None
     return options
 
 
-def _incremental(
-    pycolmap: ModuleType, database: Path, photos: Path, target: Path, config: SfmConfig, start: Path | str = ""
-) -> list[Any]:
-    options = incremental_options(pycolmap, config)
+def _incremental(project: ColmapProject, target: Path, start: Path | str = "") -> list[Any]:
+    options = incremental_options(project)
     options.multiple_models = not start
-    models = pycolmap.incremental_mapping(database, photos, target, options=options, input_path=start)
+    models = project.pycolmap.incremental_mapping(
+        project.database, project.photos, target, options=options, input_path=start
+    )
     return [model for _, model in sorted(models.items())]
 
 
-def _global(
-    pycolmap: ModuleType, database: Path, photos: Path, target: Path, graph: ViewGraph, config: SfmConfig
-) -> list[Any]:
+def _global(project: ColmapProject, target: Path, graph: ViewGraph) -> list[Any]:
     """Global mapping of a copy of the database: calibrating the view graph writes to it."""
-    calibrated = target / "database.db"
-    shutil.copyfile(database, calibrated)
+    pycolmap, config, calibrated = project.pycolmap, project.config, target / "database.db"
+    shutil.copyfile(project.database, calibrated)
     if config.focal is None:
-        _calibrate_by_seed(pycolmap, calibrated, photos, target, graph, config)
+        _calibrate_by_seed(replace(project, database=calibrated), target, graph)
         calibration = pycolmap.ViewGraphCalibrationOptions()
         calibration.random_seed = config.seed
         pycolmap.calibrate_view_graph(calibrated, calibration)
@@ -207,34 +198,32 @@ def _global(
     options.random_seed = config.seed
     options.min_model_size = SMALLEST_MODEL
     options.mapper.bundle_adjustment.refine_focal_length = config.focal is None
-    models = pycolmap.global_mapping(calibrated, photos, target, options)
+    models = pycolmap.global_mapping(calibrated, project.photos, target, options)
     return [model for _, model in sorted(models.items())]
 
 
-def _calibrate_by_seed(
-    pycolmap: ModuleType, database: Path, photos: Path, target: Path, graph: ViewGraph, config: SfmConfig
-) -> None:
+def _calibrate_by_seed(project: ColmapProject, target: Path, graph: ViewGraph) -> None:
     """Put the lenses into the database that a small incremental reconstruction finds, for photos without EXIF.
 
     Fundamental matrices alone do not fix the focal length of cameras that look at one point (Sturm 2001), which is how
     objects are photographed: on such photos the guess of 1.2 image widths stayed 70 % too long, and global mapping fell
     apart into groups.
     """
-    with pycolmap.Database.open(database) as db:
+    with project.opened() as db:
         unknown = {camera.camera_id for camera in db.read_all_cameras() if not camera.has_prior_focal_length}
     if not unknown:
         return
     folder = target / "seed"
     folder.mkdir()
-    options = incremental_options(pycolmap, config)
+    options = incremental_options(project)
     options.multiple_models = False
     options.image_names = seed_photos(graph, SEED_PHOTOS)
-    models = pycolmap.incremental_mapping(database, photos, folder, options=options)
+    models = project.pycolmap.incremental_mapping(project.database, project.photos, folder, options=options)
     if not models:
         return
     seed = max(models.values(), key=lambda model: model.num_reg_images())
     used = {seed.image(i).camera_id for i in seed.reg_image_ids()}
-    with pycolmap.Database.open(database) as db:
+    with project.opened() as db:
         for camera_id in sorted(unknown & used):
             camera = seed.camera(camera_id)
             camera.has_prior_focal_length = True
@@ -259,30 +248,29 @@ def seed_photos(graph: ViewGraph, most: int) -> list[str]:
     return chosen
 
 
-def _repaired(
-    pycolmap: ModuleType, models: list[Any], database: Path, photos: Path, target: Path, config: SfmConfig
-) -> list[Any]:
+def _repaired(project: ColmapProject, models: list[Any], target: Path) -> list[Any]:
     """The largest global model, grown incrementally by the photos it left out."""
     start, grown = target / "start", target / "grown"
     start.mkdir()
     grown.mkdir()
     largest = max(models, key=lambda model: model.num_reg_images())
     largest.write(start)
-    return _incremental(pycolmap, database, photos, grown, config, start) or models
+    return _incremental(project, grown, start) or models
 
 
-def _settled(pycolmap: ModuleType, model: Any, database: Path, photos: Path, config: SfmConfig) -> Any:
+def _settled(project: ColmapProject, model: Any) -> Any:
     """A global model whose points come from all matches again, and whose poses were adjusted to them.
 
     Global positioning drops tracks for good while the poses are still rough. 50 photos of a fox: the worst photo was
     turned by 2.4 degrees before, and by 0.24 after.
     """
-    options = incremental_options(pycolmap, config)
+    options = incremental_options(project)
     for i in range(TRIANGULATIONS):
-        model = adjusted(pycolmap, model, config)
-        folder = database.with_name(f"points{i}")
+        model = adjusted(project, model)
+        folder = project.database.with_name(f"points{i}")
         folder.mkdir()
-        model = pycolmap.triangulate_points(
-            model, database, photos, folder, options=options, refine_intrinsics=config.focal is None
+        refined = project.config.focal is None
+        model = project.pycolmap.triangulate_points(
+            model, project.database, project.photos, folder, options=options, refine_intrinsics=refined
         )
     return model

@@ -25,7 +25,7 @@ from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, features, known_poses, mapping
 from gsopt.data.sfm.diagnosis import Diagnosis
-from gsopt.data.sfm.features import ViewGraph
+from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.masks import FeatureInput, prepare_masks
 from gsopt.data.sfm.overview_image import draw_scene
@@ -79,7 +79,6 @@ class _Run:
 
     def __init__(self, pycolmap: ModuleType, source: Path, work: Path, config: SfmConfig, report: Report) -> None:
         self.pycolmap, self.source, self.work, self.config, self.report = pycolmap, source, work, config, report
-        self.database = work / "database.db"
         self.seconds: dict[str, float] = {}
 
     def posed(self) -> tuple[Path, Diagnosis]:
@@ -90,9 +89,10 @@ class _Run:
             if len(photos) == 1 or (not photos and refused):
                 raise too_few(diagnosis.explain(photos, refused, None, set()), None)
             inputs = prepare_masks(self.config.masks, self.source, photos, self.work)
-        graph, matching = self._graph(photos, inputs, frames)
+        project = ColmapProject(self.pycolmap, self.work / "database.db", inputs.photos, self.config)
+        graph, matching = self._graph(project, photos, inputs, frames)
         with self._timed("mapping"):
-            mapped = self._mapped(inputs, graph, frames)
+            mapped = self._mapped(project, graph, frames)
         if mapped is None:
             raise too_few(diagnosis.explain(photos, refused, graph, set()), graph)
         report = self._diagnose(photos, refused, graph, mapped)
@@ -130,25 +130,27 @@ class _Run:
         return [replace(known[photo.source.name], name=photo.name) for photo in photos]
 
     def _graph(
-        self, photos: list[Photo], inputs: FeatureInput, frames: list[PosedImage] | None
+        self, project: ColmapProject, photos: list[Photo], inputs: FeatureInput, frames: list[PosedImage] | None
     ) -> tuple[ViewGraph, str]:
         names = [photo.name for photo in photos]
         matching = features.choose_matching(self.config, len(names), is_video(self.source))
         with self._timed("features"):
             self.report(f"looking for features in {len(names)} photos (masks: {inputs.kind})")
-            features.extract(self.pycolmap, self.database, photos, inputs, self.config)
+            features.extract(project, photos, inputs.masks)
             if frames is not None:
-                known_poses.write_cameras(self.pycolmap, self.database, frames)
+                known_poses.write_cameras(project, frames)
         with self._timed("matching"):
-            graph = features.match(self.pycolmap, self.database, names, matching, self.config, self.report)
+            graph = features.match(project, names, matching, self.report)
         return graph, matching
 
-    def _mapped(self, inputs: FeatureInput, graph: ViewGraph, frames: list[PosedImage] | None) -> MappingResult | None:
+    def _mapped(
+        self, project: ColmapProject, graph: ViewGraph, frames: list[PosedImage] | None
+    ) -> MappingResult | None:
         if len(graph.features) < mapping.SMALLEST_MODEL:
             return None
         if frames is None:
-            return mapping.find_poses(self.pycolmap, self.database, inputs.photos, graph, self.config, self.report)
-        found = known_poses.triangulate(self.pycolmap, self.database, inputs.photos, frames, self.config)
+            return mapping.find_poses(project, graph, self.report)
+        found = known_poses.triangulate(project, frames)
         return MappingResult(found, "poses as given", [])
 
     def _diagnose(

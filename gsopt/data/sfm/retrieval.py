@@ -22,7 +22,7 @@ KMEANS_STEPS = 10
 def similar_pairs(descriptors: Sequence[UInt8[np.ndarray, "F 128"]], most: int, seed: int) -> set[tuple[int, int]]:
     """Rows (i, j), i < j, where one is among the `most` photos that look most like the other. Seeded."""
     generator = np.random.default_rng(seed)
-    chosen = [_rooted(_sampled(rows, PHOTO_FEATURES, generator)) for rows in descriptors]
+    chosen = [_sampled(rows, PHOTO_FEATURES, generator).astype(np.float32) / 512 for rows in descriptors]
     words = _words(_sampled(np.concatenate(chosen), WORD_FEATURES, generator), generator)
     vectors = np.stack([vlad(rows, words) for rows in chosen])
     likeness = vectors @ vectors.T
@@ -56,10 +56,6 @@ def _words(rows: Float32[np.ndarray, "F 128"], generator: np.random.Generator) -
 
 def _nearest(rows: Float32[np.ndarray, "F 128"], words: Float32[np.ndarray, "W 128"]) -> Int[np.ndarray, "F"]:
     return (np.square(words).sum(axis=1) - 2 * rows @ words.T).argmin(axis=1)
-
-
-def _rooted(rows: UInt8[np.ndarray, "F 128"]) -> Float32[np.ndarray, "F 128"]:
-    return rows.astype(np.float32) / 512
 
 
 def _sampled(rows: np.ndarray, most: int, generator: np.random.Generator) -> np.ndarray:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
@@ -18,7 +19,7 @@ from gsopt.raster.backend import Backend
 from gsopt.sds.guidance_step import GuidanceSetup
 from gsopt.sds.priors.protocol import Prior
 from gsopt.sds.prompts import Prompt
-from gsopt.training.guided.guard import HeldOutView, short_config, short_run, spread_views, without
+from gsopt.training.guided.guard import ShortRun, short_config, spread_views, without
 from gsopt.training.guided.references import encoded, front_camera, read_references
 from gsopt.training.mirror_images import with_mirrors
 
@@ -77,15 +78,15 @@ def compare_prompts(
             "model with --prior sd21 or a diffusers folder."
         )
     scene = with_mirrors(config, scene)
-    short = short_config(config, scene, prior.aligned)
+    short = ShortRun(short_config(config, scene, prior.aligned), backend)
     held_out = [without(scene, index) for index in spread_views(scene, max(1, config.guidance.guard_views))]
     truths: list[Tensor] = []
     outcomes = []
     for arm in arms:
         drawn, scores = [], []
         for left_out in held_out:
-            setup = None if arm.weight == 0 else _setup(short, left_out, prior, arm, report)
-            picture, truth = short_run(short, left_out, backend, setup)
+            setup = None if arm.weight == 0 else _setup(config.guidance, left_out.scene, prior, arm, report)
+            picture, truth = short.render(left_out, setup)
             drawn.append(picture)
             truths += [truth] if len(truths) < len(held_out) else []
             scores += [] if setup is None else [p.score for p in setup.conditioning.prompts if p.score is not None]
@@ -97,8 +98,8 @@ def compare_prompts(
     return Comparison(tuple(left_out.view.name for left_out in held_out), tuple(truths), tuple(outcomes))
 
 
-def _setup(config: TrainConfig, left_out: HeldOutView, prior: Prior, arm: Arm, report: Report) -> GuidanceSetup:
+def _setup(config: GuidanceConfig, scene: Scene, prior: Prior, arm: Arm, report: Report) -> GuidanceSetup:
     """The arm's prompts and reference images, encoded without the view that is left out."""
     references = read_references(arm.references, prior.size)
-    conditioning = encoded(config.guidance.image_weight, left_out.scene, prior, arm.prompts, references)
-    return GuidanceSetup(prior, conditioning, front_camera(config.guidance, left_out.scene), arm.weight, report)
+    conditioning = encoded(config.image_weight, scene, prior, arm.prompts, references)
+    return GuidanceSetup(prior, conditioning, front_camera(config, scene), arm.weight, report)

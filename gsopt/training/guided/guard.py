@@ -67,6 +67,33 @@ class HeldOutView:
     view: View
 
 
+@dataclass(frozen=True)
+class ShortRun:
+    """Short runs, alike in all but the scene and its guidance."""
+
+    config: TrainConfig
+    backend: Backend
+
+    def trained(self, scene: Scene, setup: GuidanceSetup | None) -> Trainer:
+        """A run at its end."""
+        plan = RunPlan.of(self.config, scene)
+        gaussians, _ = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
+        guidance = None if setup is None else RunGuidance(setup.on(scene, self.backend, plan.guidance))
+        trainer = Trainer(plan, scene, gaussians, self.backend, guidance)
+        while trainer.step < plan.schedule.iterations:
+            trainer.advance()
+        return trainer
+
+    def render(
+        self, left_out: HeldOutView, setup: GuidanceSetup | None
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+        """Render of the left-out view after a run on the others, 0..1 on white, and its photo."""
+        trainer = self.trained(left_out.scene, setup)
+        target = Targets([left_out.view], WHITE, 0).get(0, trainer.plan.schedule.downscale(1), WHITE)
+        colors = self.backend.forward(trainer.model.gaussians, target.camera, trainer.settings(), WHITE).colors
+        return colors.clamp(0, 1), target.colors
+
+
 def evaluate_guidance(config: TrainConfig, scene: Scene, backend: Backend, setup: GuidanceSetup) -> Verdict:
     """The share of its weight that guidance gets in the run, measured on input views that were left out."""
     guidance, aligned = config.guidance, setup.prior.aligned
@@ -75,20 +102,18 @@ def evaluate_guidance(config: TrainConfig, scene: Scene, backend: Backend, setup
     if len(scene.train) < 2:
         only = "one input view cannot say whether it helps"
         return Verdict(0.0, f"off: {only}", []) if aligned else Verdict(1.0, f"not checked: {only}", [])
-    short = short_config(config, scene, aligned)
+    short = ShortRun(short_config(config, scene, aligned), backend)
     held_out = [without(scene, index) for index in spread_views(scene, guidance.guard_views)]
     check = _check_predictions if aligned else _check_guided_runs
-    return check(short, held_out, backend, setup)
+    return check(short, held_out, setup)
 
 
-def _check_predictions(
-    config: TrainConfig, held_out: list[HeldOutView], backend: Backend, setup: GuidanceSetup
-) -> Verdict:
+def _check_predictions(short: ShortRun, held_out: list[HeldOutView], setup: GuidanceSetup) -> Verdict:
     """Passes a prior whose predictions are closer to the left-out views than the renders."""
     gains: dict[str, float] = {}
     for left_out in held_out:
-        trainer = _trained(config, left_out, backend, None)
-        guidance = setup.on(left_out.scene, backend, trainer.plan.guidance)
+        trainer = short.trained(left_out.scene, None)
+        guidance = setup.on(left_out.scene, short.backend, trainer.plan.guidance)
         first, last = guidance.plan.first_step, guidance.plan.last_step
         steps = [first + (last - first) * level // (NOISE_LEVELS - 1) for level in range(NOISE_LEVELS)]
         gaussians, settings = trainer.model.gaussians, trainer.settings()
@@ -105,14 +130,12 @@ def _check_predictions(
     return Verdict(0.0, f"{reason}, {MIN_GAIN:g} are asked for", trials)
 
 
-def _check_guided_runs(
-    config: TrainConfig, held_out: list[HeldOutView], backend: Backend, setup: GuidanceSetup
-) -> Verdict:
+def _check_guided_runs(short: ShortRun, held_out: list[HeldOutView], setup: GuidanceSetup) -> Verdict:
     """The largest factor on lambda at which guided short runs are no worse than those that are not guided."""
-    plain = _mean_psnr(config, held_out, backend, None)
+    plain = _mean_psnr(short, held_out, None)
     trials = []
     for factor in FACTORS:
-        guided = _mean_psnr(config, held_out, backend, replace(setup, weight=factor * setup.weight))
+        guided = _mean_psnr(short, held_out, replace(setup, weight=factor * setup.weight))
         trials.append({"factor": factor, "plain": round(plain, 4), "guided": round(guided, 4)})
         if guided >= plain:
             names = ", ".join(left_out.view.name for left_out in held_out)
@@ -154,31 +177,7 @@ def spread_views(scene: Scene, count: int) -> list[int]:
     return sorted(farthest_points(centers, min(count, len(scene.train))))
 
 
-def short_run(
-    config: TrainConfig, left_out: HeldOutView, backend: Backend, setup: GuidanceSetup | None
-) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
-    """Render of the left-out view after a short run on the others, 0..1 on white, and its photo."""
-    trainer = _trained(config, left_out, backend, setup)
-    target = Targets([left_out.view], WHITE, 0).get(0, trainer.plan.schedule.downscale(1), WHITE)
-    colors = backend.forward(trainer.model.gaussians, target.camera, trainer.settings(), WHITE).colors
-    return colors.clamp(0, 1), target.colors
-
-
-def _trained(config: TrainConfig, left_out: HeldOutView, backend: Backend, setup: GuidanceSetup | None) -> Trainer:
-    """A short run at its end."""
-    scene = left_out.scene
-    plan = RunPlan.of(config, scene)
-    gaussians, _ = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
-    guidance = None if setup is None else RunGuidance(setup.on(scene, backend, plan.guidance))
-    trainer = Trainer(plan, scene, gaussians, backend, guidance)
-    while trainer.step < plan.schedule.iterations:
-        trainer.advance()
-    return trainer
-
-
-def _mean_psnr(
-    config: TrainConfig, held_out: list[HeldOutView], backend: Backend, setup: GuidanceSetup | None
-) -> float:
+def _mean_psnr(short: ShortRun, held_out: list[HeldOutView], setup: GuidanceSetup | None) -> float:
     """Mean PSNR of the left-out views after short runs on the others, dB."""
-    pairs = [short_run(config, left_out, backend, setup) for left_out in held_out]
+    pairs = [short.render(left_out, setup) for left_out in held_out]
     return sum(float(capped_psnr(colors[None], truth[None])) for colors, truth in pairs) / len(held_out)
