@@ -220,10 +220,14 @@ def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock
             _check_finite(trainer, directory)
         if is_due(trainer.step, plan.checkpoint_every):
             _save(trainer, directory, clock)
-        if is_due(trainer.step, plan.preview_every):
-            _preview(trainer, directory)
-        if clock.is_due() or trainer.finished:
-            _report_progress(trainer, directory, clock)
+        try:
+            if is_due(trainer.step, plan.preview_every):
+                _preview(trainer, directory)
+            if clock.is_due() or trainer.finished:
+                _report_progress(trainer, directory, clock)
+        except InputError:  # the disk refused: keep the steps since the last checkpoint where it has room again
+            _save(trainer, directory, clock)
+            raise
     return False
 
 

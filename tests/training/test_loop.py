@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -126,6 +127,40 @@ def test_a_bug_is_an_error_event_too(dataset: Path, tmp_path: Path, monkeypatch:
     last = events(tmp_path / "run")[-1]
     assert (last["kind"], last["exit_code"]) == ("error", 1)
     assert "ZeroDivisionError" in last["message"]
+
+
+@pytest.mark.parametrize("failing", ["preview", "progress"])
+def test_a_disk_full_at_an_event_loses_no_step(
+    failing: str, dataset: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run ends with a checkpoint of its last step and whole lines; resumed, it ends in the same bytes."""
+    real, steps = os.write, []
+
+    def write(descriptor: int, data: bytes) -> int:
+        event = json.loads(data)
+        if event["kind"] == failing and not steps:
+            steps.append(event["step"])
+            raise OSError(28, "No space left on device")
+        return real(descriptor, data)
+
+    monkeypatch.setattr(os, "write", write)
+    with pytest.raises(InputError, match=r"No space left on device.*--resume"):
+        train(tiny_config(dataset), tmp_path / "run")
+    assert (tmp_path / f"run/checkpoints/step_{steps[0]:06d}.safetensors").is_file()
+    assert events(tmp_path / "run")[-1]["kind"] == "error"
+    train(tiny_config(dataset), tmp_path / "run", resume=True)
+    assert [event["seq"] for event in events(tmp_path / "run")] == list(range(len(events(tmp_path / "run"))))
+    assert (tmp_path / "run/splat.ply").read_bytes() == (finished / "splat.ply").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["log.txt", "previews", "checkpoints", "guidance", "events.jsonl"])
+def test_a_link_in_a_foreign_run_is_not_followed_on_resume(name: str, dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="symbolic link"):
+        train(tiny_config(dataset), tmp_path / "run", resume=True)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
 def test_a_run_that_is_being_written_is_refused(dataset: Path, tmp_path: Path) -> None:
