@@ -35,9 +35,14 @@ def unpremultiply(planes: Float[Tensor, "C H W"]) -> UInt8[Tensor, "H W C"]:
 
 
 def downscaled(pixels: UInt8[Tensor, "H W C"], width: int, height: int) -> UInt8[Tensor, "h w C"]:
-    """Area mean of a decoded image. Floats exist for a few rows at a time: a large photo does not fill the memory."""
+    """Area mean of a decoded image."""
+    return unpremultiply(premultiplied_downscale(pixels, width, height))
+
+
+def premultiplied_downscale(pixels: UInt8[Tensor, "H W C"], width: int, height: int) -> Float[Tensor, "C h w"]:
+    """Area mean, premultiplied. Floats exist for a few rows at a time: a large photo does not fill the memory."""
     narrow = [_area_along(premultiply(rows), 2, width) for rows in pixels.split(ROWS)]
-    return unpremultiply(_area_along(torch.cat(narrow, dim=1), 1, height))
+    return _area_along(torch.cat(narrow, dim=1), 1, height)
 
 
 def area_downscale(planes: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C h w"]:

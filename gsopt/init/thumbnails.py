@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt.data.resample import area_downscale, downscaled_size, premultiply
+from gsopt.data.resample import downscaled_size, premultiplied_downscale
 from gsopt.data.scene import View
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.farthest_points import farthest_points
@@ -50,10 +50,10 @@ def small_photos(views: Sequence[View], most: int) -> list[Thumbnail]:
 
 
 def _small(view: View) -> Thumbnail:
-    planes = premultiply(view.pixels())
-    factor = max(1.0, max(planes.shape[1:]) / MAX_SIDE)
-    width, height = (downscaled_size(size, factor) for size in (planes.shape[2], planes.shape[1]))
-    planes = (area_downscale(planes, width, height) + 0.5).clamp(0, 255).to(torch.uint8)
+    pixels = view.pixels()
+    factor = max(1.0, max(pixels.shape[:2]) / MAX_SIDE)
+    width, height = (downscaled_size(size, factor) for size in (pixels.shape[1], pixels.shape[0]))
+    planes = (premultiplied_downscale(pixels, width, height) + 0.5).clamp(0, 255).to(torch.uint8)
     if len(planes) == 3:
         planes = torch.cat([planes, torch.full_like(planes[:1], 255)])
     return Thumbnail(view.camera.resized(width, height), planes, colored=view.color > 0)
