@@ -23,6 +23,8 @@ from gsopt.data.sfm.photos import sharpness
 from gsopt.errors import InputError
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".3gp", ".gif")
+CONTAINERS = {"format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo,gif"}
+"""FFmpeg's names for SUFFIXES: its playlists (concat, hls) would open other files."""
 MEASURED_SIDE = 256
 """Longer side at which frames are measured, px."""
 TILES_PER_SIDE = 4
@@ -162,7 +164,7 @@ def _decoded(av: ModuleType, video: Path) -> Iterator[tuple[int, Any]]:
     """Every frame that can be decoded; a file that breaks off is read up to there."""
     index = 0
     try:
-        with av.open(str(video), metadata_errors="replace") as container:
+        with av.open(str(video), container_options=CONTAINERS, metadata_errors="replace") as container:
             if not container.streams.video:
                 raise InputError(f"{video} holds no video track, only sound or data. Give another file.")
             for frame in container.decode(video=0):

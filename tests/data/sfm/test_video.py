@@ -10,7 +10,15 @@ import pytest
 import textured_room as room
 from PIL import Image, ImageFilter
 
-from gsopt.data.sfm.video import MAX_MOTION, MIN_MOTION, FrameMeasurement, choose, extract_frames, motion_between
+from gsopt.data.sfm.video import (
+    MAX_MOTION,
+    MIN_MOTION,
+    SUFFIXES,
+    FrameMeasurement,
+    choose,
+    extract_frames,
+    motion_between,
+)
 from gsopt.errors import InputError
 
 av = pytest.importorskip("av", reason="the extra sfm is not installed")
@@ -48,6 +56,30 @@ def test_a_title_that_is_no_utf8_does_not_matter(pan: list[Image.Image], tmp_pat
     same = extract_frames(plain, tmp_path / "again", 150)
     assert [path.name for path in chosen.paths] == [path.name for path in same.paths]
     assert chosen.decoded == 8
+
+
+@pytest.mark.parametrize("suffix", [suffix for suffix in SUFFIXES if suffix not in (".mpg", ".mpeg", ".webm", ".gif")])
+def test_h264_is_read_from_every_container(pan: list[Image.Image], tmp_path: Path, suffix: str) -> None:
+    assert extract_frames(film(tmp_path / f"a{suffix}", pan[:3]), tmp_path / "frames", 9).decoded == 3
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mpg", "mpeg2video"), (".webm", "libvpx"), (".gif", "gif")])
+def test_other_codecs_are_read_too(pan: list[Image.Image], tmp_path: Path, suffix: str, codec: str) -> None:
+    with av.open(str(tmp_path / f"a{suffix}"), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "rgb8" if codec == "gif" else "yuv420p"
+        for picture in pan[:3]:
+            container.mux(stream.encode(av.VideoFrame.from_image(picture).reformat(format=stream.pix_fmt)))
+        container.mux(stream.encode())
+    assert extract_frames(tmp_path / f"a{suffix}", tmp_path / "frames", 9).decoded == 3
+
+
+def test_a_playlist_is_no_video_whatever_its_name_says(pan: list[Image.Image], tmp_path: Path) -> None:
+    """FFmpeg would open the files that it names."""
+    film(tmp_path / "private.mkv", pan[:3])
+    (tmp_path / "a.mp4").write_text("ffconcat version 1.0\nfile private.mkv\n")
+    with pytest.raises(InputError, match=r"a\.mp4 cannot be decoded.*Copy it again"):
+        extract_frames(tmp_path / "a.mp4", tmp_path / "frames", 9)
 
 
 def test_frames_are_apart_by_the_motion_asked_for(pan: list[Image.Image], tmp_path: Path) -> None:
