@@ -38,10 +38,10 @@ class LastingFile(io.RawIOBase):
 
 
 def outlast_readers() -> LastingFile | None:
-    """Makes stdout and stderr lasting and able to print any text, once; returns what is beneath stdout.
+    """Makes stdout and stderr lasting and able to print any text, once; returns what is beneath stdout,
+    or None where a caller put streams of its own in their place, which are left as they are.
 
-    Closed descriptors are opened first: the next file that is opened would become stdout otherwise. Streams that a
-    caller put in their place are left as they are: None.
+    Closed descriptors are opened first: the next file that is opened would become stdout otherwise.
     """
     for descriptor in (0, 1, 2):
         try:

@@ -39,8 +39,8 @@ class Focus:
 def find_focus(cameras: list[Cameras], extent: float) -> Focus:
     """The point nearest to all viewing axes by least squares, or a guess `5 * extent` ahead of the mean camera.
 
-    When the axes do not converge but the origin stands before every camera, inside its image, it is the origin:
-    captures of objects put the object there.
+    Axes that do not converge give the origin where it stands before every camera, inside its image: captures of
+    objects put the object there.
     """
     centers = torch.cat([camera.centers for camera in cameras]).double()
     axes = torch.cat([camera.forwards for camera in cameras]).double()

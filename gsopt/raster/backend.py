@@ -83,7 +83,7 @@ class Gradients:
     logit_opacities: Float[Tensor, "N"]
     sh0: Float[Tensor, "N 1 3"]
     shN: Float[Tensor, "N K-1 3"] | None
-    """Rows of bands above the rendered sh_degree are zero. None when `backward` had `bands=False`."""
+    """Zero in bands above the rendered sh_degree; absent when `backward` had `bands=False`."""
     means2d: Float[Tensor, "N 2"]
     """dLoss/d(mean2d), 1/px: signed sum over pixels."""
     means2d_abs: Float[Tensor, "N 2"] | None

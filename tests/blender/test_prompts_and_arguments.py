@@ -58,7 +58,7 @@ def test_pictures_are_named_only_where_they_lie(tmp_path: Path) -> None:
         [{"text": 3}],
         [{"text": "a\x1b[2J"}],
         [{"text": "a" * 1001}],
-        [{"text": "a", "colour": 1}],
+        [{"text": "a", "hue": 1}],
         [{"text": "a", "weight": "1"}],
         [{"text": "a", "weight": -1}],
         [{"text": "a", "weight": 10**400}],
