@@ -75,7 +75,7 @@ def test_a_scene_that_is_missing_is_an_error_before_any_run(tmp_path: Path, caps
         ('title = "Mine"', 'title = "Mine"\nlength = 3', "must be the keys about, groups, root, title"),
         ('name = "blobs"', 'name = "blobs"\nseed = 3', r"groups\[0\].* must be the keys"),
         ('about = "A few blobs."', "", "must be the keys"),
-        ('about = "A few blobs."', "about = 3", "about` must be str, got '3'"),
+        ('about = "A few blobs."', "about = 3", "about` must be str, got 3"),
         ('title = "Mine"', 'title = "Mine', "must be valid TOML"),
         ('title = "Mine"', 'title = "Mine"\nroot = "/etc"', "root` must be \"package\" or absent, .* got '/etc'"),
         ('name = "blobs"', 'name = "../../blobs"', "name` must be letters, digits"),
