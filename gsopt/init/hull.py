@@ -63,13 +63,13 @@ def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoi
     covered = sum(float((photo.planes[3] > 127).double().mean()) for photo in photos) / len(photos)
     if covered > _FULL_COVERAGE:
         return None
-    if len(photos) == 1:
+    if scene.guessed:
         grid = inflated(photos[0], scene.extent)
     else:
         grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
     if grid is None:
         return None
-    if 1 < len(photos) < UNROUNDED_FROM:
+    if len(photos) < UNROUNDED_FROM and not scene.guessed:
         cells = rounded(grid.occupied, grid.centers(grid.occupied), grid.voxel, photos)
         grid = replace(grid, occupied=cells)
     xyz = _sample_points(grid, photos, count, generator)

@@ -110,7 +110,7 @@ def test_up_is_z_unless_the_photo_is_rolled_against_it(roll: float, is_z: bool) 
 
 
 def test_first_gaussians_of_one_photo_fill_the_body(tmp_path: Path) -> None:
-    scene = one_photo(tmp_path, 30, (0.7, 0.7, 0.7))
+    scene = with_guessed_views(one_photo(tmp_path, 30, (0.7, 0.7, 0.7)), make_backend("cpu", 1))
     gaussians, why = first_gaussians(scene, InitConfig(count=500), 0, 0)
     assert "inflated silhouette" in why
     assert float((gaussians.means.norm(dim=1) < 1.0).double().mean()) > 0.8
