@@ -15,6 +15,8 @@ from gsopt.errors import InputError, SettingError, UsageError, shortened
 if TYPE_CHECKING:
     from torch import Tensor
 
+MAX_THREADS = 1024
+
 
 @dataclass(frozen=True)
 class Within:
@@ -91,6 +93,23 @@ def finite(name: str, tensor: Tensor, largest: float = math.inf) -> None:
     got = tensor[index].item()
     limit = "" if math.isinf(largest) else f" and within {largest:.3g}"
     raise InputError(f"`{name}` must be finite{limit}, got {got} at index {list(index)}. Remove or repair that row.")
+
+
+def instance(name: str, value: object, kind: type) -> None:
+    """Raise InputError unless the value is of this type."""
+    if not isinstance(value, kind):
+        raise InputError(f"`{name}` must be of type {kind.__name__}, got {type(value).__name__}. Convert it first.")
+
+
+def dense(name: str, value: object) -> None:
+    """Raise InputError unless the value is a dense tensor of floats with an axis at least."""
+    import torch
+
+    instance(name, value, torch.Tensor)
+    assert isinstance(value, torch.Tensor)
+    if value.layout != torch.strided or not value.is_floating_point() or value.ndim == 0:
+        got = f"{value.dtype}, {value.layout}, {value.ndim} axes"
+        raise InputError(f"`{name}` must be a dense tensor of floats, got {got}. Use to_dense() or float() first.")
 
 
 def shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:

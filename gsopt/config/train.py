@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from gsopt import check
 from gsopt.check import Within
-from gsopt.config.bounds import MAX_WEIGHT, Count, Decay, PositiveCount, ShDegree, Weight
+from gsopt.config.bounds import MAX_WEIGHT, Count, Decay, PositiveCount, ShDegree, Threads, Weight
 from gsopt.config.from_json import build
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.presets import Preset, with_preset
@@ -259,7 +259,7 @@ class TrainConfig:
     """Seed of every random number: same seed, same data, same bits."""
     backend: Literal["auto", "cpu", "reference"] = "auto"
     """Rasterizer; reference is plain torch, a slow oracle for tiny scenes."""
-    threads: Count = 0
+    threads: Threads = 0
     """Number of threads, 0 = one per core. The result does not depend on it."""
     antialiased: bool = False
     """Mip-Splatting's 2D filter."""

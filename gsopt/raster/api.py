@@ -14,10 +14,12 @@ from gsopt.errors import InputError, MissingDependency
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.autograd import draw
-from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.raster.backend import Backend, RasterSettings, enough_memory
 
 BACKENDS = ("auto", "cpu", "reference")
 FLOAT32_MAX = torch.finfo(torch.float32).max
+MAX_SIDE = 1 << 24
+"""Width and height of an image, px: beyond, float32 misses pixels."""
 DEFAULT_SETTINGS = RasterSettings()
 
 
@@ -46,10 +48,25 @@ def rasterize(
     """Draw every camera. Differentiable, once, in the six parameters and the background (not in the cameras).
 
     `backend` is a Backend or a name that `make_backend` knows; `threads` is heeded for a name only (0 = one per core).
-    Raises InputError for tensors of wrong shape, dtype or value, MissingDependency when the backend is not built.
+    Raises InputError for tensors of wrong shape, dtype or value, NumericalError for an image that memory cannot hold,
+    MissingDependency when the backend is not built.
     """
+    _validate_types(gaussians, cameras, settings, background)
     _validate(gaussians, cameras, background)
-    engine = make_backend(backend, threads) if isinstance(backend, str) else backend
+    engine = make_backend(backend, threads) if not hasattr(backend, "forward") else backend
+    assert not isinstance(engine, str)
+    with enough_memory(len(gaussians), cameras.width, cameras.height):
+        return _stacked(engine, gaussians, cameras, settings, background, depth)
+
+
+def _stacked(
+    engine: Backend,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RasterSettings,
+    background: Float[Tensor, "3"] | None,
+    depth: bool,
+) -> Rendering:
     images = [draw(engine, gaussians, cameras[c], settings, background, depth) for c in range(len(cameras))]
     colors = torch.stack([colors for colors, _, _, _ in images])
     alphas = torch.stack([alphas for _, alphas, _, _ in images])
@@ -73,8 +90,11 @@ def make_backend(name: str = "auto", threads: int = 0) -> Backend:
 
     Raises UsageError for an unknown name, MissingDependency when the compiled extension is not built.
     """
+    check.instance("backend", name, str)
     check.one_of("backend", name, BACKENDS)
+    check.instance("threads", threads, int)
     check.at_least("threads", threads, 0, "0 takes one thread per core.")
+    check.within("threads", threads, 0, check.MAX_THREADS, "0 takes one thread per core.")
     if name == "reference":
         from gsopt.raster.reference import ReferenceBackend
 
@@ -88,6 +108,25 @@ def make_backend(name: str = "auto", threads: int = 0) -> Backend:
         ) from error
     backend: Backend = module.CpuBackend(threads)
     return backend
+
+
+def _validate_types(gaussians: object, cameras: object, settings: object, background: object) -> None:
+    for name, value, kind in (
+        ("gaussians", gaussians, Gaussians),
+        ("cameras", cameras, Cameras),
+        ("settings", settings, RasterSettings),
+    ):
+        check.instance(name, value, kind)
+    assert isinstance(gaussians, Gaussians)
+    assert isinstance(cameras, Cameras)
+    tensors = [*gaussians.items(), ("viewmats", cameras.viewmats), ("Ks", cameras.Ks), ("background", background)]
+    for tensor_name, tensor in tensors:
+        if tensor_name != "background" or tensor is not None:
+            check.dense(tensor_name, tensor)
+    for side, pixels in (("width", cameras.width), ("height", cameras.height)):
+        check.instance(side, pixels, int)
+        check.at_least(side, pixels, 1, "Give the image size in pixels.")
+        check.within(side, pixels, 1, MAX_SIDE, "Give the image size in pixels.")
 
 
 def _validate(gaussians: Gaussians, cameras: Cameras, background: Tensor | None) -> None:

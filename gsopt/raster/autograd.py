@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsopt.errors import UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Backend, RasterSettings
@@ -49,6 +50,7 @@ class _Draw(torch.autograd.Function):
         depths = None if frame.depths is None else frame.depths.detach()
         kept = replace(frame, colors=frame.colors.detach(), alphas=frame.alphas.detach(), depths=depths)
         ctx.backend, ctx.frame = backend, kept
+        ctx.parameters = [(tensor.detach(), tensor._version) for tensor in parameters]  # detached: no cycle
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
         return frame.colors, frame.alphas, frame.depths, frame.radii
@@ -63,6 +65,9 @@ class _Draw(torch.autograd.Function):
         v_background = (v_colors * (1 - frame.alphas[..., None])).sum((0, 1)) if ctx.needs_input_grad[4] else None
         if not any(ctx.needs_input_grad[5:]):
             return (None, None, None, None, v_background, *(None for _ in ctx.needs_input_grad[5:]))
+        for name, (tensor, version) in zip(PARAMETERS, ctx.parameters, strict=True):
+            if tensor._version != version:  # as torch's own functions refuse it
+                raise UsageError(f"`{name}` must be as it was drawn, got other values. Draw again after changing it.")
         gradients = ctx.backend.backward(frame, v_colors, _contiguous(v_alphas), _contiguous(v_depths))
         return (None, None, None, None, v_background, *(getattr(gradients, name) for name in PARAMETERS))
 

@@ -20,6 +20,9 @@ The image model, which the float64 reference defines and every backend follows:
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -27,6 +30,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gsopt import check
+from gsopt.errors import NumericalError
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
 
@@ -173,3 +177,17 @@ class Backend(Protocol):
         Y(direction of view) ⊗ gradients.sh0 / Y_0 then.
         """
         ...
+
+
+@contextmanager
+def enough_memory(count: int, width: int, height: int) -> Iterator[None]:
+    """NumericalError where memory cannot hold an image of `count` Gaussians."""
+    try:
+        yield
+    except (MemoryError, OverflowError, RuntimeError) as error:
+        if type(error) is RuntimeError and not re.search("allocate|overflow", str(error)):  # torch has no other kind
+            raise
+        raise NumericalError(
+            f"Drawing {count:,} Gaussians at {width}x{height} needs more memory than there is: {error}. Draw fewer or "
+            "smaller splats, or a smaller image (`-r`)."
+        ) from error

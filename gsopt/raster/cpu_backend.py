@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsopt.errors import NumericalError, UsageError
+from gsopt.errors import UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
-from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame
+from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame, enough_memory
 
 ISA_VARIABLE = "GSOPT_ISA"
 GRADIENTS = tuple(field.name for field in fields(Gradients))
@@ -78,20 +78,15 @@ class CpuBackend:
         gaussians = _as_float32(gaussians)
         model = _model(gaussians)
         view = self._views.of(camera, settings)
-        frame = self._idle.pop() if self._idle else _cpu.Frame()
-        colors, alphas = torch.empty(height, width, 3), torch.empty(height, width)
-        depths = torch.empty(height, width) if depth else None
-        radii = torch.empty(n, 2, dtype=torch.int32)
-        image = _cpu.Image(colors, alphas, depths, radii)
         behind = (0.0, 0.0, 0.0) if background is None else background.tolist()
         degree = min(settings.sh_degree, gaussians.sh_degree)
-        try:
+        with enough_memory(n, width, height):
+            colors, alphas = torch.empty(height, width, 3), torch.empty(height, width)
+            depths = torch.empty(height, width) if depth else None
+            radii = torch.empty(n, 2, dtype=torch.int32)
+            image = _cpu.Image(colors, alphas, depths, radii)
+            frame = self._idle.pop() if self._idle else _cpu.Frame()
             _cpu.forward(self._workspace, frame, model, view, image, sh_degree=degree, background=behind)
-        except (MemoryError, OverflowError) as error:
-            raise NumericalError(
-                f"Drawing {n:,} Gaussians at {width}x{height} needs more memory than there is: {error}. Draw fewer or "
-                "smaller splats, or a smaller image (`-r`)."
-            ) from error
         return RenderedFrame(colors, alphas, depths, radii, _Context(frame, model, gaussians))
 
     def backward(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from raster_scenes import Case, make_case, weights_like
 from tolerances import EXACT
 from torch import Tensor
 
-from gsopt.errors import InputError, MissingDependency, UsageError
+from gsopt.errors import GsoptError, InputError, MissingDependency, NumericalError, UsageError
 from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import Rendering, expected_depth, make_backend, rasterize
@@ -147,6 +149,67 @@ def test_wrong_shapes_types_and_cameras_are_refused() -> None:
         rasterize(g, camera[0:0], backend="reference")
     with pytest.raises(UsageError, match="`focal length` must be at least"):
         rasterize(g, replace(camera, Ks=-camera.Ks), backend="reference")
+
+
+def with_field(name: str, value: object) -> Callable[[Case], dict[str, object]]:
+    """Arguments of a call in which one field of the Gaussians or cameras has another value."""
+
+    def build(case: Case) -> dict[str, object]:
+        if name in PARAMETERS:
+            own = value(getattr(case.gaussians, name)) if callable(value) else value
+            return {"gaussians": replace(case.gaussians, **{name: own})}
+        own = value(getattr(case.camera, name)) if callable(value) else value
+        return {"cameras": replace(case.camera, **{name: own})}
+
+    return build
+
+
+@pytest.mark.parametrize(
+    ("build", "text"),
+    [
+        (with_field("means", None), "`means` must be of type Tensor, got NoneType"),
+        (with_field("sh0", "text"), "`sh0` must be of type Tensor, got str"),
+        (with_field("quats", lambda t: t.numpy()), "`quats` must be of type Tensor, got ndarray"),
+        (with_field("means", lambda t: t.to_sparse()), "`means` must be a dense tensor of floats"),
+        (with_field("means", lambda t: t.long()), "`means` must be a dense tensor of floats"),
+        (with_field("means", torch.tensor(1.0)), "`means` must be a dense tensor of floats"),
+        (with_field("viewmats", lambda t: t.numpy()), "`viewmats` must be of type Tensor, got ndarray"),
+        (with_field("Ks", lambda t: t + 1j), "`Ks` must be a dense tensor of floats"),
+        (with_field("width", "20"), "`width` must be of type int, got str"),
+        (with_field("height", 2**31), r"`height` must lie in \[1, 16777216\]"),
+        (lambda case: {"gaussians": None}, "`gaussians` must be of type Gaussians, got NoneType"),
+        (lambda case: {"cameras": "camera"}, "`cameras` must be of type Cameras, got str"),
+        (lambda case: {"settings": {}}, "`settings` must be of type RasterSettings, got dict"),
+        (lambda case: {"background": [1, 1, 1]}, "`background` must be of type Tensor, got list"),
+        (lambda case: {"backend": None}, "`backend` must be of type str, got NoneType"),
+        (lambda case: {"threads": "2"}, "`threads` must be of type int, got str"),
+        (lambda case: {"threads": 1025}, r"`threads` must lie in \[0, 1024\], got 1025"),
+    ],
+)
+def test_what_is_no_tensor_is_named(build: Callable[[Case], dict[str, Any]], text: str) -> None:
+    case = make_case(21)
+    with pytest.raises(GsoptError, match=text):
+        rasterize(**{"gaussians": case.gaussians, "cameras": case.camera, "backend": "reference", **build(case)})
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_an_image_that_memory_cannot_hold_is_named(backend: str) -> None:
+    case = make_case(21)
+    camera = replace(case.camera, width=1 << 24, height=1 << 24)
+    with pytest.raises(NumericalError, match="at 16777216x16777216 needs more memory than there is"):
+        rasterize(case.gaussians, camera, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_parameters_that_changed_since_they_were_drawn_have_no_gradient(name: str, backend: str) -> None:
+    case = make_case(21)
+    gaussians = leaves(replace(case, gaussians=case.gaussians.to(torch.float32)))
+    loss = rasterize(gaussians, case.camera, backend=backend).colors.sum()
+    with torch.no_grad():
+        getattr(gaussians, name).mul_(0.5)
+    with pytest.raises(UsageError, match=f"`{name}` must be as it was drawn"):
+        loss.backward()
 
 
 def test_a_backend_is_chosen_by_name_only() -> None:

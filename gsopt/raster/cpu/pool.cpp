@@ -1,6 +1,7 @@
 #include "pool.h"
 
 #include <chrono>
+#include <system_error>
 
 #if defined(__x86_64__)
 #include <immintrin.h>
@@ -9,11 +10,22 @@
 #include <pthread.h>
 #include <sched.h>
 #endif
+#if defined(__unix__) || defined(__APPLE__)
+#include <unistd.h>
+#endif
 
 namespace gsopt {
 namespace {
 
 constexpr auto kSpin = std::chrono::microseconds(50);
+
+long this_process() {
+#if defined(__unix__) || defined(__APPLE__)
+  return getpid();
+#else
+  return 0;
+#endif
+}
 
 inline void relax() {
 #if defined(__x86_64__)
@@ -35,30 +47,42 @@ template <class Ready> bool spin(Ready ready) {
 
 }  // namespace
 
-Pool::Pool(int threads) {
+Pool::Pool(int threads) : process_(this_process()) {
 #if defined(__linux__)
   cpu_set_t allowed;
   if (sched_getaffinity(0, sizeof(allowed), &allowed) == 0 && CPU_COUNT(&allowed) >= threads)
     for (int core = 0; core < CPU_SETSIZE; ++core)
       if (CPU_ISSET(core, &allowed)) cores_.push_back(core);
 #endif
-  for (int k = 1; k < threads; ++k) workers_.emplace_back([this, k] { work(k); });
+  workers_.reserve(threads);
+  try {
+    for (int k = 1; k < threads; ++k) workers_.emplace_back([this, k] { work(k); });
+  } catch (const std::system_error&) {
+  }
 }
 
+bool Pool::in_forked_child() const { return process_ != this_process(); }
+
 Pool::~Pool() {
+  if (in_forked_child()) {  // the threads are the parent's, and its workers wait on `wake_` for ever
+    static_cast<void>(new std::vector<std::thread>(std::move(workers_)));  // neither joined nor detached: not here
+    static_cast<void>(wake_.release());
+    return;
+  }
   {
     std::lock_guard lock(mutex_);
     stop_ = true;
     generation_.fetch_add(1, std::memory_order_release);
   }
-  wake_.notify_all();
+  wake_->notify_all();
   for (auto& worker : workers_) worker.join();
 }
 
 void Pool::run(int items, Task task, void* context) {
   if (items <= 0) return;
-  std::lock_guard turn(turn_);
-  if (workers_.empty() || items == 1) {
+  const bool alone = in_forked_child();  // where a thread of the parent may have held `turn_`
+  std::lock_guard turn(alone ? child_turn_ : turn_);
+  if (alone || workers_.empty() || items == 1) {
     for (int k = 0; k < items; ++k) task(context, k, 0);
     return;
   }
@@ -74,7 +98,7 @@ void Pool::run(int items, Task task, void* context) {
     busy_.store(static_cast<int>(workers_.size()), std::memory_order_relaxed);
     generation_.fetch_add(1, std::memory_order_release);
   }
-  wake_.notify_all();
+  wake_->notify_all();
   take(0);
   while (!spin([this] { return busy_.load(std::memory_order_acquire) == 0; })) std::this_thread::yield();
 }
@@ -110,7 +134,7 @@ void Pool::work(int worker) {
   for (;;) {
     if (!spin([&] { return generation_.load(std::memory_order_acquire) != seen; })) {
       std::unique_lock lock(mutex_);
-      wake_.wait(lock, [&] { return generation_.load(std::memory_order_acquire) != seen; });
+      wake_->wait(lock, [&] { return generation_.load(std::memory_order_acquire) != seen; });
     }
     {
       std::lock_guard lock(mutex_);

@@ -1,9 +1,11 @@
 // A small thread pool: workers spin for a moment, then sleep; work is handed out by an atomic counter.
-// Results never depend on which worker takes which item.
+// Results never depend on which worker takes which item, so a pool that the system refuses threads goes on with fewer, and
+// in a forked child, which has none of its parent's, the caller does all.
 #pragma once
 #include <atomic>
 #include <condition_variable>
 #include <mutex>
+#include <memory>
 #include <thread>
 #include <vector>
 
@@ -16,6 +18,7 @@ class Pool {
   Pool(const Pool&) = delete;
   Pool& operator=(const Pool&) = delete;
 
+  // As many as could be started.
   int threads() const { return static_cast<int>(workers_.size()) + 1; }
 
   // Plain function and context: nothing here is instantiated in a file compiled for one instruction set only.
@@ -29,10 +32,11 @@ class Pool {
   void work(int worker);
   void leave_core_of_caller(int worker, int& pinned) const;
   void take(int worker);
+  bool in_forked_child() const;
 
   std::vector<std::thread> workers_;
-  std::mutex turn_, mutex_;
-  std::condition_variable wake_;
+  std::mutex turn_, mutex_, child_turn_;
+  std::unique_ptr<std::condition_variable> wake_ = std::make_unique<std::condition_variable>();
   std::atomic<uint64_t> generation_{0};
   std::atomic<int> next_{0}, busy_{0};
   int items_ = 0;
@@ -41,6 +45,7 @@ class Pool {
   int caller_core_ = -1;
   std::vector<int> cores_;  // cores this process may use; empty where the system does not tell
   bool stop_ = false;
+  long process_;
 };
 
 }  // namespace gsopt
