@@ -218,16 +218,16 @@ def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock
         require_finite_loss(loss, view, trainer.step, _last_good(directory))
         if trainer.step % FINITE_EVERY == 0:
             _check_finite(trainer, directory)
-        if is_due(trainer.step, plan.checkpoint_every):
-            _save(trainer, directory, clock)
         try:
-            if is_due(trainer.step, plan.preview_every):
+            if is_due(trainer.step, plan.preview_every):  # first: the steps before a checkpoint are not taken again
                 _preview(trainer, directory)
             if clock.is_due() or trainer.finished:
                 _report_progress(trainer, directory, clock)
         except InputError:  # the disk refused: keep the steps since the last checkpoint where it has room again
             _save(trainer, directory, clock)
             raise
+        if is_due(trainer.step, plan.checkpoint_every):
+            _save(trainer, directory, clock)
     return False
 
 

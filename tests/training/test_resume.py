@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ from gsopt.config.train import (
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import read_events
+from gsopt.training import loop
 from gsopt.training.checkpoint import read_checkpoint, save_checkpoint, saved
 from gsopt.training.loop import train
 from gsopt.training.plan import RunPlan
@@ -178,6 +180,29 @@ def test_killed_then_resumed(moment: str, dataset: Path, whole: dict[str, bytes]
     assert bool(leftovers) == ("config.json" in moment or "renaming" in moment)
     assert run_bytes(config, run, resume=True) == whole["few views"]
     assert list(run.rglob(".*.tmp")) == []  # nothing half-written is left
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_no_preview_is_lost_by_a_death_at_a_checkpoint(
+    when: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def save(folder: Path, step: int, *args: Any) -> Path:
+        if step == 10 and when == "before":
+            raise Killed
+        path = save_checkpoint(folder, step, *args)
+        if step == 10:
+            raise Killed
+        return path
+
+    config = replace(configs(dataset)["adc"], checkpoint_every=5, preview_every=5, iterations=15)
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "save_checkpoint", save)
+        with pytest.raises(Killed):
+            train(config, tmp_path / "run")
+    train(config, tmp_path / "run", resume=True)
+    events, _ = read_events(tmp_path / "run" / "events.jsonl")
+    assert {event["step"] for event in events if event["kind"] == "preview"} == {5, 10, 15}
+    assert len(list((tmp_path / "run" / "previews").iterdir())) == 3
 
 
 def test_a_broken_checkpoint_is_told_and_the_one_before_is_used(
