@@ -172,7 +172,7 @@ def test_a_prior_that_fails_the_guard_by_failing_is_off(dataset: Path, tmp_path:
     train(config(dataset, guard_views=1, guard_steps=20), tmp_path / "run")
     guard = guard_of(tmp_path / "run")
     assert guard["factor"] == 0
-    assert "not finite" in guard["reason"] or "answered nan" in guard["reason"]
+    assert "not finite" in guard["reason"] or "predicted nan" in guard["reason"]
 
 
 def test_a_corrupt_reference_image_stops_before_any_training(dataset: Path, tmp_path: Path, prior: PixelPrior) -> None:
