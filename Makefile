@@ -16,7 +16,7 @@ PIP := $(PY) -m pip --disable-pip-version-check install -qq --constraint constra
 # The build tools are pinned too, which an isolated build would not heed.
 INSTALL := $(PIP) --no-build-isolation --editable
 SOURCES := pyproject.toml constraints.txt \
-  $(shell find gsopt/raster -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt)
+  $(shell find gsopt/raster -name CMakeFiles -prune -o \( -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt \) -print)
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:

@@ -57,8 +57,7 @@ Pool::Pool(int threads) : process_(this_process()) {
   workers_.reserve(threads);
   try {
     for (int k = 1; k < threads; ++k) workers_.emplace_back([this, k] { work(k); });
-  } catch (const std::system_error&) {
-  }
+  } catch (const std::system_error&) {}
 }
 
 bool Pool::in_forked_child() const { return process_ != this_process(); }

@@ -1,6 +1,6 @@
 // A small thread pool: workers spin for a moment, then sleep; work is handed out by an atomic counter.
-// Results never depend on which worker takes which item, so a pool that the system refuses threads goes on with fewer, and
-// in a forked child, which has none of its parent's, the caller does all.
+// Results never depend on which worker takes which item, so a pool that the system refuses threads goes on with fewer,
+// and in a forked child, which has none of its parent's, the caller does all.
 #pragma once
 #include <atomic>
 #include <condition_variable>
