@@ -19,6 +19,6 @@ def test_a_text_prior_that_loses_a_fraction_of_a_decibel_gets_a_lower_factor(
     measured = iter([20.0, *(20.0 - loss for loss in losses)])
     monkeypatch.setattr(guard, "_mean_psnr", lambda *args: next(measured))
     setup = GuidanceSetup(None, None, None, 0.2, print)  # type: ignore[arg-type]
-    verdict = guard._check_guided_runs(TrainConfig(), [], ReferenceBackend(), setup)
+    verdict = guard._check_guided_runs(guard.ShortRun(TrainConfig(), ReferenceBackend()), [], setup)
     assert verdict.factor == factor
     assert [trial["factor"] for trial in verdict.trials] == list(guard.FACTORS[: len(losses)])

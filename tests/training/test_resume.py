@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -173,7 +174,8 @@ def test_killed_then_resumed(moment: str, dataset: Path, whole: dict[str, bytes]
     run, config = tmp_path / "run", configs(dataset)["few views"]
     file = tmp_path / "config.json"
     file.write_text(json.dumps(config.to_dict()))
-    done = subprocess.run([sys.executable, str(KILLED_RUN), str(file), str(run), moment], check=False)
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}  # the helpers of tests/ too
+    done = subprocess.run([sys.executable, str(KILLED_RUN), str(file), str(run), moment], check=False, env=paths)
     assert done.returncode == -signal.SIGKILL
     assert not {"done", "stopped", "error"} & set(kinds(run))
     leftovers = [path.name for path in run.rglob(".*.tmp")]
