@@ -32,6 +32,8 @@ SIDE = 112
 """Voxels along each side of the grid."""
 MARGIN = 1.25
 """Half side of the grid over the half diagonal of the silhouette's box: room for a tilted body."""
+MAX_DISTANCE_SIDE = 200
+"""Longer side of the mask that distances are taken in, px: `squared_distance` is exact up to 90."""
 MAX_ROLL = 0.05
 """Vertical component of the camera's right axis up to which the world's z axis counts as up."""
 
@@ -47,9 +49,10 @@ def inflated(photo: Thumbnail, extent: float) -> Grid | None:
     points = grid.centers()
     column, row, depth = project(photo.camera, points)
     rows = torch.nonzero(inside(photo.camera, column, row, depth))[:, 0]
-    distances = torch.stack(silhouette_distances(solid))
+    factor = -(-max(solid.shape) // MAX_DISTANCE_SIDE)
+    distances = factor * torch.stack(silhouette_distances(solid[factor // 2 :: factor, factor // 2 :: factor]))
     column, row = column[rows], row[rows]
-    inset, width = sample(distances, column, row) * (depth[rows] / float(photo.camera.Ks[0, 0, 0]))
+    inset, width = sample(distances, column / factor, row / factor) * (depth[rows] / float(photo.camera.Ks[0, 0, 0]))
     framed = (points[rows] - middle).norm(dim=1) <= frame
     cone = framed & (sample(photo.alpha(), column, row)[0] > 0.5)
     rows, column, row, inset, width = (values[cone] for values in (rows, column, row, inset, width))

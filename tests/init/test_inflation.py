@@ -23,14 +23,14 @@ from gsopt.raster.api import make_backend
 SIZE = 96
 
 
-def camera(elevation: float, roll: float = 0.0, distance: float = 4.0) -> Cameras:
+def camera(elevation: float, roll: float = 0.0, distance: float = 4.0, size: int = SIZE) -> Cameras:
     """A camera that looks at the origin from so many degrees above the horizon, rolled about its axis (degrees)."""
     angle, tilt = math.radians(elevation), math.radians(roll)
     eye = torch.tensor([[distance * math.cos(angle), 0.0, distance * math.sin(angle)]], dtype=torch.float64)
     viewmats = look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     turn = torch.eye(4, dtype=torch.float64)
     turn[:2, :2] = torch.tensor([[math.cos(tilt), -math.sin(tilt)], [math.sin(tilt), math.cos(tilt)]])
-    return Cameras(turn @ viewmats, intrinsics(0.7, SIZE, SIZE)[None], SIZE, SIZE)
+    return Cameras(turn @ viewmats, intrinsics(0.7, size, size)[None], size, size)
 
 
 def photo_of(camera: Cameras, solid: torch.Tensor) -> Thumbnail:
@@ -53,6 +53,17 @@ def test_a_ball_stays_nearly_a_ball_from_any_elevation(tmp_path: Path, elevation
     volume = len(inside) * grid.voxel**3 / (4 / 3 * math.pi * 0.7**3)
     assert 0.8 < volume < 1.4  # sheared by up to 30 degrees against the ray
     assert float((inside < 0.8).double().mean()) > share
+
+
+def test_a_large_photo_gives_the_same_body_as_a_small_one(tmp_path: Path) -> None:
+    volumes = []
+    for size in (96, 480):
+        folder = ellipsoid_scene(tmp_path / str(size), camera(0, size=size), (0, 0, 0), (1.0, 1.0, 1.0))
+        scene = load_scene(folder)
+        grid = inflated(small_photos(scene.train, 1)[0], scene.extent)
+        assert grid is not None
+        volumes.append(int(grid.occupied.sum()) * grid.voxel**3)
+    assert volumes[1] == pytest.approx(volumes[0], rel=0.1)
 
 
 def test_a_tall_body_stands_upright_though_the_camera_looks_down(tmp_path: Path) -> None:
