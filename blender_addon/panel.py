@@ -258,6 +258,8 @@ def draw_summary(layout: Any, thing: Any) -> None:
     if found is None or not found.count:
         return
     box.label(text=f"{found.count:,} splats, {found.outliers:,} outliers")
+    if found.left_out:
+        box.label(text=f"{found.left_out:,} left out: not finite, or no rotation", icon="ERROR")
     row = box.row()
     for title, bars in (("Opacity from", found.opacities), ("Size from", found.sizes)):
         column = row.column(align=True)

@@ -51,6 +51,10 @@ class MissingDependency(GsoptError):
     exit_code = 2
 
 
+class InputWarning(UserWarning):
+    """A file was read, but not all of it could be used; `gsopt` prints the message as one line on stderr."""
+
+
 def shortened(value: object) -> str:
     """A value of a file as messages repeat it: at most 80 characters, however long or deeply nested it is."""
     return _SHORT.repr(value)[:80]

@@ -43,6 +43,8 @@ class Splats:
     """[N, 3] coefficients of band 0; the color from every side is 0.5 + C0 * base, sRGB-coded."""
     sh: Floats
     """[N, K-1, 3] coefficients of bands 1 and up."""
+    left_out: int = 0
+    """Rows of the file that cannot be drawn."""
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -59,7 +61,8 @@ class Splats:
 
     def rows(self, chosen: Any) -> Splats:
         """Those rows: a mask, numbers or a slice."""
-        return replace(self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: part[chosen] for name, part in parts.items() if isinstance(part, np.ndarray)})
 
     def at_most(self, count: int) -> Splats:
         """Every k-th row, so that no more than `count` are left."""
@@ -69,22 +72,22 @@ class Splats:
 def from_file_values(
     positions: Floats, log_scales: Floats, quaternions: Floats, logits: Floats, base: Floats, sh: Floats, path: object
 ) -> Splats:
-    """Activated splats from what the files of the field hold. InputError names the property and the row that is not
-    finite or no rotation."""
-    named = {"position": positions, "scale_*": log_scales, "rot_*": quaternions, "opacity": logits}
-    for name, values in {**named, "f_dc_*": base, "f_rest_*": sh}.items():
-        if values.size and not np.isfinite(values.sum(dtype=np.float64)):
-            bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-            row = int(bad.argmax())
-            raise InputError(f"{path}: `{name}` of splat {row} must be finite, got {values[row]}. Export it again.")
-    length = np.linalg.norm(quaternions, axis=1)
-    if len(length) and not length.min() > 0:
-        row = int(length.argmin())
-        raise InputError(f"{path}: the rotation of splat {row} has no length, got 0 0 0 0. Export it again.")
-    with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-logits))
-    scales = np.exp(np.clip(log_scales, -LARGEST_LOG, LARGEST_LOG))
-    return Splats(positions, scales, quaternions / length[:, None], opacities.astype(np.float32), base, sh)
+    """Activated splats from what the files of the field hold. Rows with a value that is not finite or a rotation of no
+    length are left out, an infinite logit is an opacity of 0 or 1. InputError when no row is left."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternions, axis=1)
+        opacities = (1 / (1 + np.exp(-logits))).astype(np.float32)
+        good = (length > 0) & np.isfinite(length)
+        for values in (positions, log_scales, opacities, base, sh):
+            if values.size and not np.isfinite(values.sum(dtype=np.float64)):
+                good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        scales = np.exp(np.clip(log_scales, -LARGEST_LOG, LARGEST_LOG))
+    left_out = len(good) - int(good.sum())
+    if left_out and left_out == len(good):
+        raise InputError(f"{path} holds no splat that can be drawn, got {left_out} with NaN. Export it again.")
+    length[~good] = 1
+    found = Splats(positions, scales, quaternions / length[:, None], opacities, base, sh)
+    return replace(found.rows(good), left_out=left_out) if left_out else found
 
 
 def log_scales(splats: Splats) -> Floats:

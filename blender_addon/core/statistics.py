@@ -39,6 +39,8 @@ class Summary:
     sizes: tuple[Bar, ...]
     """Geometric mean of the three scales, bins equal in the logarithm."""
     outliers: int
+    left_out: int = 0
+    """Rows of the file that cannot be drawn."""
 
 
 def sizes(splats: Splats) -> NDArray[np.float32]:
@@ -74,6 +76,7 @@ def summary(splats: Splats) -> Summary:
         opacities=bars(splats.opacities, np.linspace(0, 1, BINS + 1)),
         sizes=bars(np.clip(size, edges[0], edges[-1]), edges),
         outliers=int(outliers(splats).sum()),
+        left_out=splats.left_out,
     )
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import difflib
 import importlib
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 
 from gsopt._version import __version__
 from gsopt.cli.standard_streams import outlast_readers
-from gsopt.errors import GsoptError, InputError, UsageError, refused
+from gsopt.errors import GsoptError, InputError, InputWarning, UsageError, refused
 
 VERBS = {
     "sfm": "find the poses of photos or a video",
@@ -38,7 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     beneath = outlast_readers()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        code = answer(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = _shower(warnings.showwarning)
+            warnings.simplefilter("always", InputWarning)
+            code = answer(arguments)
         sys.stdout.flush()
         logged = arguments[0] in LOGGED and not {"-h", "--help"} & set(arguments)
         if beneath is None or beneath.failure is None or logged:
@@ -53,6 +57,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("gsopt: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _shower(others: Callable[..., None]) -> Callable[..., None]:
+    """Shows an InputWarning as one line of gsopt; passes any other warning on."""
+
+    def show(message: Warning | str, category: type[Warning], *where: object) -> None:
+        if issubclass(category, InputWarning):
+            print(f"gsopt: warning: {message}", file=sys.stderr)
+        else:
+            others(message, category, *where)
+
+    return show
 
 
 def lost_output(failure: OSError) -> int:

@@ -28,6 +28,8 @@ class Flags:
     """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz or .glb."""
     force: bool = False
     """Replace OUT if it exists."""
+    strict: bool = False
+    """Refuse a file with a splat that cannot be drawn (NaN, no rotation) instead of leaving that splat out."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -41,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
         raise InputError(f"`--out` must lie in a folder that exists, got {out.parent}. Create it first.")
     source = splats_in(flags.source)
     antialiased = is_antialiased(source)
-    gaussians = load_splats(source)
+    gaussians = load_splats(source, strict=flags.strict)
     save_splats(out, gaussians, antialiased=antialiased)
     if suffix == ".splat" and gaussians.sh_degree > 0:
         print("gsopt: note: .splat has no view-dependent color; bands 1 and up were dropped", file=sys.stderr)

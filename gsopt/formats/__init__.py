@@ -62,13 +62,22 @@ def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased:
             save_glb(path, gaussians)
 
 
-def load_splats(path: str | PathLike[str]) -> Gaussians:
+def load_splats(path: str | PathLike[str], *, strict: bool = False) -> Gaussians:
     """Read splats in the format that the suffix of `path` names; float32 on the CPU, every value finite.
 
-    The file is not trusted: its header is checked against its size before memory is allocated. Raises InputError for
-    any defect.
+    The file is not trusted: its header is checked against its size before memory is allocated. Infinite logits of
+    opacities become ±6.9; splats with other values that are not finite, or with a rotation of no length, are left out
+    and counted in one InputWarning. `strict` refuses them. Raises InputError for any other defect.
     """
+    from gsopt.formats.validation import checked, usable
+
     path = Path(path)
+    gaussians = _read(path)
+    return checked(gaussians, path) if strict else usable(gaussians, path)
+
+
+def _read(path: Path) -> Gaussians:
+    """The splats of a file as they stand there, not yet checked."""
     match suffix_of(path):
         case ".splat":
             from gsopt.formats.splat import load_splat

@@ -23,7 +23,7 @@ from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply import read_splats
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import float_blocks, raw_blocks, seek_element
-from gsopt.formats.validation import BYTE_OPACITY_MARGIN, checked, logit, storable
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN, logit, opacity_bytes, storable
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.morton import morton_order
@@ -50,7 +50,7 @@ def save_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     """Write a .compressed.ply with the splats in Morton order, so that a chunk's splats are neighbors.
 
     Reading back differs by at most: means and log-scales 1/4094 (axes 0 and 2) and 1/2046 (axis 1) of the extent of
-    their chunk of 256, log-scales held to ±20; sh0 1/510 of the chunk's extent; opacity 0.5/255; bands 1 and up 1/64
+    their chunk of 256, log-scales held to ±20; sh0 1/510 of the chunk's extent; opacity 1/255; bands 1 and up 1/64
     in ±3.9, clamped outside; each component of the unit quaternion, up to its sign, 0.0021.
     """
     gaussians = storable(gaussians, path)
@@ -94,7 +94,7 @@ def _pack(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.uint32]
         parts.append(
             np.divide(values - low[chunk].astype(np.float64), extent, out=np.zeros(values.shape), where=extent > 0)
         )
-    opacities = gaussians.opacities.double().numpy()
+    opacities = opacity_bytes(gaussians.opacities).double().numpy() / 255
     packed = np.empty((n, 4), "<u4")
     packed[:, 0] = _join(parts[0], _BITS_3)
     packed[:, 1] = _pack_smallest_three(normalize(gaussians.quats.double()).numpy())
@@ -163,7 +163,7 @@ def read_compressed(file: BinaryIO, header: Header, file_size: int, path: Path) 
     extremes[:, len(_WITHOUT_COLOR) :] = [0, 0, 0, 1, 1, 1]
     seek_element(file, header, chunk, file_size, path)
     names = [name for name in _EXTREMES if name in chunk.names]
-    with np.errstate(invalid="ignore"):  # `checked` refuses the splats of a NaN
+    with np.errstate(invalid="ignore"):  # the caller drops the splats of a NaN
         for rows, block in _placed(float_blocks(file, header, chunk, path)):
             extremes[rows, : len(names)] = block[:, [chunk.names.index(name) for name in names]]
     file.seek(header.size)
@@ -174,7 +174,7 @@ def read_compressed(file: BinaryIO, header: Header, file_size: int, path: Path) 
     shN = np.empty((vertex.count, 0, 3), np.float32)
     if bands is not None:
         shN = _read_bands(file, header, bands, file_size, path)
-    return checked(_unpack(extremes, packed, shN), path)
+    return _unpack(extremes, packed, shN)
 
 
 def _read_bands(file: BinaryIO, header: Header, bands: Element, file_size: int, path: Path) -> NDArray[np.float32]:
@@ -222,7 +222,7 @@ def _unpack(extremes: NDArray[np.float64], packed: NDArray[np.uint32], shN: NDAr
     color = _split(packed[:, 3], _BITS_4)
     parts = (_split(packed[:, 0], _BITS_3), _split(packed[:, 2], _BITS_3), color[:, :3])
     chunk = np.arange(len(packed)) // CHUNK
-    with np.errstate(over="ignore", invalid="ignore"):  # `checked` refuses what is not finite
+    with np.errstate(over="ignore", invalid="ignore"):  # the caller drops what is not finite
         means, log_scales, rgb = (
             torch.from_numpy((low[chunk] * (1 - part) + high[chunk] * part).astype(np.float32))
             for part, low, high in zip(parts, *(np.split(extremes, 6, axis=1)[i::2] for i in (0, 1)), strict=True)

@@ -22,7 +22,7 @@ from gsopt.formats.axes import LEFT_UP_FORWARD, with_flipped_axes
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Document, read_container
 from gsopt.formats.glb_splats import EXTENSION, Accessor, splat_primitives
-from gsopt.formats.validation import MAX_SH_DEGREE, checked, log_scales, logit, scales, storable, to_bytes
+from gsopt.formats.validation import MAX_SH_DEGREE, log_scales, logit, scales, storable, to_bytes
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.quats import normalize
@@ -30,8 +30,8 @@ from gsopt.geometry.quats import normalize
 _FLOAT, _BYTE = 5126, 5121
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAX_SIZE = (1 << 32) - 1
-_OPACITY_MARGIN = 2.0**-25
-"""Least distance of a float32 sigmoid from 0 and 1."""
+_OPACITY_MARGIN = 2.0**-24
+"""Least distance of a float32 below 1 from it: opacities keep it from 0 and 1, so that their logits are finite."""
 
 
 def save_glb(path: Path, gaussians: Gaussians) -> None:
@@ -65,7 +65,7 @@ def _attributes(gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
     yield "COLOR_0", to_bytes(rgba * 255)
     yield f"{EXTENSION}:ROTATION", normalize(gaussians.quats.double()).float()[:, [1, 2, 3, 0]]
     yield f"{EXTENSION}:SCALE", scales(gaussians.log_scales)
-    yield f"{EXTENSION}:OPACITY", gaussians.opacities[:, None]
+    yield f"{EXTENSION}:OPACITY", gaussians.opacities[:, None].clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
     yield f"{EXTENSION}:SH_DEGREE_0_COEF_0", gaussians.sh0[:, 0]
     for degree in range(1, gaussians.sh_degree + 1):
         for order in range(2 * degree + 1):
@@ -122,7 +122,7 @@ def load_glb(path: Path) -> Gaussians:
     degree = max(part.sh_degree for part in parts)
     parts = [part.with_sh_degree(degree) for part in parts]
     joined = Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name, _ in parts[0].items()})
-    return checked(with_flipped_axes(joined, LEFT_UP_FORWARD), path)
+    return with_flipped_axes(joined, LEFT_UP_FORWARD)
 
 
 def _read(file: BinaryIO, primitive: dict[str, Accessor], document: Document) -> Gaussians:

@@ -20,7 +20,7 @@ from gsopt.errors import InputError
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import BLOCK, float_blocks, seek_element
-from gsopt.formats.validation import BANDS, MAX_SH_DEGREE, checked, storable
+from gsopt.formats.validation import BANDS, MAX_SH_DEGREE, storable
 from gsopt.gaussians import PARAMETERS, Gaussians
 
 _MEANS = ("x", "y", "z")
@@ -103,7 +103,7 @@ def read_splats(file: BinaryIO, header: Header, file_size: int, path: Path) -> G
             target = out[name][rows].numpy()
             target[...] = values.reshape(target.shape)
         start += len(block)
-    return checked(Gaussians(**out), path)
+    return Gaussians(**out)
 
 
 def _columns(bands: int) -> dict[str, tuple[str, ...]]:

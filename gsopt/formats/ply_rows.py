@@ -77,7 +77,7 @@ def _binary_block(file: BinaryIO, header: Header, element: Element, rows: int, p
     block = _read(file, dtype, rows, path)
     if {kind for _, kind in element.columns} == {"f4"}:
         return block.view(f"{header.byte_order}f4").reshape(rows, len(element.columns)).astype(np.float32, copy=False)
-    # a double beyond float32 becomes inf, a signaling NaN a quiet one: `checked` refuses both
+    # a double beyond float32 becomes inf, a signaling NaN a quiet one
     with np.errstate(over="ignore", invalid="ignore"):
         return np.stack([block[name].astype(np.float32) for name in element.names], axis=1)
 

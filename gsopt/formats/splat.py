@@ -13,7 +13,7 @@ import torch
 
 from gsopt.errors import InputError
 from gsopt.formats.files import opened, read_exactly, replacing
-from gsopt.formats.validation import BYTE_OPACITY_MARGIN, checked, log_scales, logit, scales, storable, to_bytes
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN, log_scales, logit, opacity_bytes, scales, storable, to_bytes
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.quats import normalize
@@ -25,7 +25,7 @@ _BLOCK = 1 << 16
 def save_splat(path: Path, gaussians: Gaussians) -> None:
     """Write a .splat, keeping the order of the rows; bands 1 and up of the spherical harmonics are dropped.
 
-    Reading back differs by at most: means 0; log-scales 1e-5 within ±87 (a float32's range); opacity 0.5/255;
+    Reading back differs by at most: means 0; log-scales 1e-5 within ±87 (a float32's range); opacity 1/255;
     color 0.5/255 where it lies in [0, 1], else clamped; each component of the unit quaternion 1/128.
     """
     gaussians = storable(gaussians, path)
@@ -38,8 +38,8 @@ def _pack(gaussians: Gaussians) -> np.ndarray:
     rows = np.empty(len(gaussians), _ROW)
     rows["mean"] = gaussians.means.numpy()
     rows["scale"] = scales(gaussians.log_scales).numpy()
-    rgb = sh.rgb_from_sh0(gaussians.sh0[:, 0])
-    rows["rgba"] = to_bytes(torch.cat([rgb, gaussians.opacities[:, None]], dim=1) * 255).numpy()
+    rows["rgba"][:, :3] = to_bytes(sh.rgb_from_sh0(gaussians.sh0[:, 0]) * 255).numpy()
+    rows["rgba"][:, 3] = opacity_bytes(gaussians.opacities).numpy()
     rows["quat"] = to_bytes(normalize(gaussians.quats.double()) * 128 + 128).numpy()
     return rows
 
@@ -53,7 +53,7 @@ def load_splat(path: Path) -> Gaussians:
                 "The file was cut short or is no .splat: copy or export it again."
             )
         data = read_exactly(file, size, path, "its splats")
-    return checked(_unpack(np.frombuffer(data, _ROW)), path)
+    return _unpack(np.frombuffer(data, _ROW))
 
 
 def _unpack(rows: np.ndarray) -> Gaussians:

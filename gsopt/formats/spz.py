@@ -19,7 +19,7 @@ from gsopt.formats.axes import RIGHT_UP_BACK, with_flipped_axes
 from gsopt.formats.compression import GzipStream, check_budget, deflated, unzstd, zstandard_compressed
 from gsopt.formats.files import opened, read_exactly, replacing
 from gsopt.formats.spz_codes import pack, stream_sizes, unpack
-from gsopt.formats.validation import MAX_SH_DEGREE, checked, storable
+from gsopt.formats.validation import MAX_SH_DEGREE, storable
 from gsopt.gaussians import Gaussians
 
 _MAGIC = b"NGSP"
@@ -56,7 +56,7 @@ def save_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False, ver
     """Write a .spz of version 3, which every reader knows, or 4, which needs the package `zstandard`.
 
     Reading back differs by at most: means half of 2^-b scene units, b = 16 where every |coordinate| < 128 and less for
-    larger scenes (12 at 2048, 0 at 2^23, beyond which InputError); log-scales 1/32 in [-10, 5.9]; opacity 0.5/255;
+    larger scenes (12 at 2048, 0 at 2^23, beyond which InputError); log-scales 1/32 in [-10, 5.9]; opacity 1/255;
     sh0 0.0131 in ±3.3; band 1 0.036 and bands 2, 3 0.067 in ±0.9, clamped outside; each component of the unit
     quaternion, up to its sign, 0.0022. The order of the rows is kept.
     """
@@ -88,7 +88,7 @@ def load_spz(path: Path) -> Gaussians:
         read = _read_gzip if _is_gzip(file, path) else _read_zstandard
         header, streams = read(file, size, path)
     gaussians = unpack(streams, header.count, header.sh_degree, header.version, header.fraction_bits)
-    return checked(with_flipped_axes(gaussians, RIGHT_UP_BACK), path)
+    return with_flipped_axes(gaussians, RIGHT_UP_BACK)
 
 
 def spz_antialiased(path: Path) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsopt.errors import InputError
-from gsopt.formats.validation import BYTE_OPACITY_MARGIN, logit, to_bytes
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN, logit, opacity_bytes, to_bytes
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.quats import normalize
 
@@ -40,7 +40,7 @@ def pack(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
     fraction_bits = _fraction_bits(gaussians.means, path)
     streams = [
         _pack_positions(gaussians.means, fraction_bits),
-        to_bytes(gaussians.opacities * 255),
+        opacity_bytes(gaussians.opacities),
         to_bytes(gaussians.sh0 * (_COLOR_SCALE * 255) + 127.5),
         to_bytes((gaussians.log_scales + 10) * 16),
         _pack_smallest_three(gaussians.quats),

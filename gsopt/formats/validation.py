@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gsopt.errors import InputError
+from gsopt.errors import InputError, InputWarning
 from gsopt.gaussians import Gaussians
 
 MAX_SH_DEGREE = 3
@@ -19,6 +22,8 @@ _MAX_LOG = 87.0
 """exp(±87) are normal float32 numbers."""
 BYTE_OPACITY_MARGIN = 0.25 / 255
 """Distance of the opacities of bytes 0 and 255 from 0 and 1: their logits are finite and round to the same byte."""
+_MAX_LOGIT = math.log(1 / BYTE_OPACITY_MARGIN - 1)
+"""Stands for an infinite logit, which other tools make of bytes 0 and 255."""
 
 
 def storable(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -36,13 +41,49 @@ def checked(gaussians: Gaussians, path: Path, consequence: str = "Remove or repa
             row, *column = torch.nonzero(~torch.isfinite(tensor))[0].tolist()
             where = f"`{ply_name(name, column, gaussians.shN.shape[1])}` of row {row}"
             raise InputError(f"{path}: {where} must be finite, got {tensor[(row, *column)].item()}. {consequence}")
-    length2 = gaussians.quats.square().sum(dim=1)
-    unusable = ~((length2 >= _TINY) & torch.isfinite(length2))
-    if bool(unusable.any()):
-        row = int(torch.nonzero(unusable)[0])
+    unusable = torch.nonzero(~_has_length(gaussians.quats))
+    if len(unusable):
+        row = int(unusable[0])
         got = ", ".join(f"{value:g}" for value in gaussians.quats[row].tolist())
         raise InputError(f"{path}: the rotation (rot_0..3) of row {row} has no usable length, got {got}. {consequence}")
     return gaussians
+
+
+def usable(gaussians: Gaussians, path: Path) -> Gaussians:
+    """The splats that can be drawn; readers of every format end with it.
+
+    Infinite logits of opacities become ±6.9. A splat with another value that is not finite, or with a rotation of no
+    length, is dropped; one InputWarning counts them. Raises InputError when no splat of the file is left.
+    """
+    _check_shapes(gaussians, path)
+    logits = torch.where(
+        gaussians.logit_opacities.isinf(),
+        gaussians.logit_opacities.clamp(-_MAX_LOGIT, _MAX_LOGIT),
+        gaussians.logit_opacities,
+    )
+    gaussians = replace(gaussians, logit_opacities=logits)
+    good = _has_length(gaussians.quats)
+    for _, tensor in gaussians.items():
+        if tensor.numel() and not bool(torch.isfinite(tensor.sum())):
+            good &= torch.isfinite(tensor.reshape(len(gaussians), -1)).all(dim=1)
+    dropped = len(gaussians) - int(good.sum())
+    if not dropped:
+        return gaussians
+    if dropped == len(gaussians):
+        raise InputError(f"{path} holds no splat that can be drawn, got {dropped} with NaN. Export it again.")
+    warnings.warn(
+        f"{path}: {dropped} of {len(gaussians)} splats were left out: a value is not finite, or a rotation has no "
+        "length. `--strict` refuses such files.",
+        InputWarning,
+        stacklevel=3,
+    )
+    return gaussians.select(good)
+
+
+def _has_length(quats: Tensor) -> Tensor:
+    """[N] True for rotations that can be normalized."""
+    length2 = quats.square().sum(dim=1)
+    return (length2 >= _TINY) & torch.isfinite(length2)
 
 
 def _check_shapes(gaussians: Gaussians, path: Path) -> None:
@@ -81,8 +122,13 @@ def scales(log_scales: Tensor) -> Tensor:
 
 
 def log_scales(scales: Tensor) -> Tensor:
-    """Natural logarithm of scales; 0 counts as the least normal float32, negative ones give NaN for `checked`."""
+    """Natural logarithm of scales; 0 counts as the least normal float32, negative ones give NaN."""
     return torch.where(scales < 0, torch.nan, scales.clamp_min(_TINY)).log()
+
+
+def opacity_bytes(opacities: Tensor) -> Tensor:
+    """Opacities as bytes 1 to 254: other tools turn 0 and 255 into infinite logits."""
+    return (opacities * 255).round().clamp(1, 254).to(torch.uint8)
 
 
 def to_bytes(values: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from blender_addon.core.spz import read_spz
 
 def assert_alike(a: Splats, b: Splats, tolerance: float) -> None:
     for field in fields(Splats):
-        left, right = getattr(a, field.name), getattr(b, field.name)
+        left, right = np.asarray(getattr(a, field.name)), np.asarray(getattr(b, field.name))
         assert left.shape == right.shape
         assert np.allclose(left, right, rtol=tolerance, atol=tolerance), field.name
 
@@ -95,14 +95,32 @@ def test_a_ply_that_lies_is_refused(tmp_path: Path, old: bytes, new: bytes, cut:
 
 
 @pytest.mark.parametrize(("name", "value"), [("positions", np.nan), ("scales", np.inf), ("rotations", 0.0)])
-def test_a_value_that_is_none_is_named_with_its_row(
+def test_a_splat_that_cannot_be_drawn_is_left_out_and_counted(
     tmp_path: Path, some_splats: Splats, name: str, value: float
 ) -> None:
     getattr(some_splats, name)[7] = value
     with np.errstate(invalid="ignore"):
         write_ply(tmp_path / "a.ply", some_splats)
-    with pytest.raises(InputError, match="splat 7"):
-        read_ply(tmp_path / "a.ply")
+    with np.errstate(invalid="ignore"):
+        again = read_ply(tmp_path / "a.ply")
+    assert again.left_out == 1
+    assert len(again) == len(some_splats) - 1
+    assert np.array_equal(again.base, np.delete(some_splats.base, 7, axis=0))
+
+
+def test_an_infinite_logit_is_an_opacity_of_0_or_1_and_nan_alone_is_refused(
+    tmp_path: Path, some_splats: Splats
+) -> None:
+    write_ply(tmp_path / "a.ply", some_splats)
+    head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    rows = np.frombuffer(data, "<f4").reshape(len(some_splats), -1).copy()
+    rows[:2, -8] = -np.inf, np.inf
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + rows.tobytes())
+    assert read_ply(tmp_path / "b.ply").opacities[:2].tolist() == [0, 1]
+    rows[:] = np.nan
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + rows.tobytes())
+    with pytest.raises(InputError, match="no splat that can be drawn"):
+        read_ply(tmp_path / "b.ply")
 
 
 def test_a_failed_write_keeps_the_old_file(

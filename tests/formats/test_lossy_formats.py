@@ -16,6 +16,8 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.morton import morton_order
 
 BYTE = 0.5 / 255 + 1e-6
+END = 1 / 255 + 1e-6
+"""Bytes 0 and 255 are infinite logits elsewhere, so that no writer uses them for opacities."""
 C0 = 0.28209479177387814
 
 
@@ -128,8 +130,8 @@ def test_extremes_are_clamped_to_the_end_of_their_side(tmp_path: Path, suffix: s
     back = round_trip(tmp_path / f"a{suffix}", splats)
     low = rows_of(splats, suffix).logit_opacities.argmin()
     high = rows_of(splats, suffix).logit_opacities.argmax()
-    assert back.opacities[low] < 0.001
-    assert back.opacities[high] > 0.999
+    assert back.opacities[low] <= END
+    assert back.opacities[high] >= 1 - END
     assert back.log_scales[low].max() < -9
     assert back.log_scales[high].min() > 5
     assert back.sh0[low].max() <= -0.5 / C0 + 1e-5

@@ -97,7 +97,7 @@ ROW = " ".join(["1"] * 14) + "\n"
 def test_text_that_lies_is_refused(tmp_path: Path, body: str, message: str) -> None:
     (tmp_path / "a.ply").write_text(ASCII + "end_header\n" + body)
     with pytest.raises(InputError, match=message):
-        load_splats(tmp_path / "a.ply")
+        load_splats(tmp_path / "a.ply", strict=True)
 
 
 def test_text_needs_no_last_line_end(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def test_a_known_splat_reads_as_known_values(tmp_path: Path) -> None:
 def test_a_splat_that_lies_is_refused(tmp_path: Path, data: bytes, message: str) -> None:
     (tmp_path / "a.splat").write_bytes(data)
     with pytest.raises(InputError, match=message):
-        load_splats(tmp_path / "a.splat")
+        load_splats(tmp_path / "a.splat", strict=True)
 
 
 def test_a_flat_splat_gets_the_least_scale(tmp_path: Path) -> None:
@@ -143,4 +143,4 @@ def test_chunks_that_are_not_finite_are_named(tmp_path: Path) -> None:
     ply["chunk"].data["max_z"][1] = np.nan
     ply.write(path)
     with pytest.raises(InputError, match="`z` of row 256"):
-        load_splats(path)
+        load_splats(path, strict=True)
