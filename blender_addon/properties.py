@@ -32,7 +32,7 @@ DOMAINS = [
     ("own", "Own", "A template of your own"),
 ]
 PRIORS = [
-    ("auto", "As gsopt Decides", "The embedded prior where it is installed, else none; the run says which and why"),
+    ("auto", "As gsopt Decides", "The embedded prior where prompts or images ask for one, else none"),
     ("off", "Off", "Photos alone decide"),
     ("embedded", "Embedded", "The small prior that comes with gsopt"),
     ("sd21", "Stable Diffusion 2.1", "The community's copy, downloaded by diffusers"),

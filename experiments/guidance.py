@@ -28,16 +28,16 @@ UNGUARDED = ["--lambda-sds", "0.2", "--guidance.guard-views", "0"]
 SDS = ["--guidance.policy", "sds", *UNGUARDED]
 ARMS: dict[str, list[str]] = {
     "off": ["--lambda-sds", "0"],
-    "default": [],
+    "default": ["--lambda-sds", "0.2"],
     "recon": ["--guidance.policy", "recon", *UNGUARDED],
     "sds": SDS,
     "sds, words": [*SDS, "--guidance.references", "0", "--guidance.image-weight", "0"],
 }
-"""`words`: the prior gets the object's name instead of input views. All arms but `default` are guided for any number of
-views, and without the guard."""
+"""`words`: the prior gets the object's name instead of input views. `default`: with the guard, as a run is guided where
+somebody asks for it; the others without."""
 NAMES = {
     "off": "unguided",
-    "default": "default",
+    "default": "guarded",
     "recon": "recon, the policy that is taken by itself",
     "sds": "SDS that sees the input views",
     "sds, words": "SDS that sees the object's name, no views",

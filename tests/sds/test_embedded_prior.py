@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,10 +13,10 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.priors.protocol import Condition
 from gsopt.sds.priors.view_conditioned import ViewPrior
-from gsopt.sds.select_prior import PriorSelection, restrict_to_scene, select_prior
+from gsopt.sds.select_prior import select_prior
 
 pytest.importorskip("diffusers")
-DEFAULT = PriorSelection("embedded", 0.2, "the embedded prior (default)")
+NONE = {"lambda_sds": 0.0}
 
 
 def test_the_folder_is_small_and_says_what_it_is(embedded: Path) -> None:
@@ -40,8 +41,7 @@ def test_nothing_it_learned_from_is_a_test_object(shared_data: Path, embedded: P
 
 
 @pytest.mark.usefixtures("embedded")
-def test_it_is_the_default_and_answers_the_same_bits_each_time() -> None:
-    assert select_prior(GuidanceConfig()) == DEFAULT
+def test_it_answers_the_same_bits_each_time() -> None:
     first, second = (open_prior("embedded", GuidanceConfig()) for _ in range(2))
     assert isinstance(first, ViewPrior)
     x_t = torch.randn(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
@@ -51,20 +51,22 @@ def test_it_is_the_default_and_answers_the_same_bits_each_time() -> None:
     assert not torch.equal(a[0], 2 * render[:3] - 1)
 
 
+@pytest.mark.usefixtures("embedded")
 @pytest.mark.parametrize(
-    ("views", "has_alpha", "said", "guided"),
+    "asked",
     [
-        (4, True, {}, True),
-        (5, True, {}, True),
-        (6, True, {}, False),
-        (6, True, {"prompt": ("a chair",)}, True),
-        (4, False, {}, False),
-        (40, False, {"lambda_sds": 0.2}, True),
+        {"lambda_sds": 0.2},
+        {"prior": "embedded"},
+        {"prompt": ("a chair",)},
+        {"negative": ("a table",)},
+        {"prompts": "prompts.json"},
+        {"ref_image": ("chair.png",)},
     ],
 )
-def test_it_guides_few_views_of_cut_out_objects_or_where_it_was_asked_for(views, has_alpha, said, guided) -> None:
-    found = restrict_to_scene(DEFAULT, GuidanceConfig(**said), views, has_alpha)
-    assert (found.prior == "embedded") == guided
-    assert guided or found.weight == 0
-    other = PriorSelection("sd21", 0.2, "as asked for with --prior")
-    assert restrict_to_scene(other, GuidanceConfig(prior="sd21"), views, has_alpha) == other
+def test_it_guides_where_somebody_asks_and_nowhere_else(asked: dict[str, Any]) -> None:
+    choice = select_prior(GuidanceConfig(**asked))
+    assert (choice.name, choice.weight) == ("embedded", 0.2)
+    assert "as asked for with --" in choice.reason
+    for silent in (GuidanceConfig(), GuidanceConfig(policy="recon", device="cpu"), GuidanceConfig(**asked | NONE)):
+        assert select_prior(silent).name is None
+        assert select_prior(silent).weight == 0

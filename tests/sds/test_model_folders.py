@@ -140,15 +140,16 @@ def test_what_is_no_name_at_all_is_a_usage_error(name: str) -> None:
         find_folder(name) if name else GuidanceConfig(prior=name)
 
 
-def test_without_a_prior_at_hand_the_default_is_off_and_says_why() -> None:
+def test_the_default_is_off_and_says_how_to_ask() -> None:
     choice = select_prior(GuidanceConfig())
-    assert (choice.prior, choice.weight) == (None, 0.0)
-    assert "no prior at hand" in choice.reason
+    assert (choice.name, choice.weight) == (None, 0.0)
+    assert "nobody asked" in choice.reason
+    assert "--lambda_sds 0.2" in choice.reason
 
 
 def test_zero_is_off_whatever_else_was_given() -> None:
     choice = select_prior(GuidanceConfig(lambda_sds=0, prior="sd21", prompt=("a chair",)))
-    assert (choice.prior, choice.weight) == (None, 0.0)
+    assert (choice.name, choice.weight) == (None, 0.0)
     assert "lambda_sds is 0" in choice.reason
 
 

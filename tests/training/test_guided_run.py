@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from analytic_priors import PixelPrior, gaussian_posterior
-from tiny_scenes import tiny_config
+from tiny_scenes import tiny_config, write_dataset
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import DataConfig, OptimizerConfig, TrainConfig
@@ -181,20 +181,37 @@ def test_a_corrupt_reference_image_stops_before_any_training(dataset: Path, tmp_
         train(config(dataset, ref_image=(str(tmp_path / "ref.png"),)), tmp_path / "run")
 
 
-def test_at_lambda_0_nothing_of_diffusion_is_loaded_and_the_reason_is_told(dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("asked", "reason"), [(0.0, "lambda_sds is 0"), (None, "nobody asked for a prior")])
+def test_where_nobody_asks_nothing_of_diffusion_is_loaded_and_the_reason_is_told(
+    asked: float | None, reason: str, dataset: Path, tmp_path: Path
+) -> None:
     import subprocess
 
     script = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "from pathlib import Path\nfrom tiny_scenes import tiny_config\nfrom gsopt.training.loop import train\n"
-        f"train(tiny_config(Path({str(dataset)!r}), iterations=2), Path({str(tmp_path / 'run')!r}))\n"
+        "from gsopt.config.guidance import GuidanceConfig\n"
+        f"config = tiny_config(Path({str(dataset)!r}), iterations=2, guidance=GuidanceConfig(lambda_sds={asked}))\n"
+        f"train(config, Path({str(tmp_path / 'run')!r}))\n"
         "assert not {'diffusers', 'transformers', 'huggingface_hub'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     started = read_events(tmp_path / "run" / "events.jsonl")[0][0]
     assert started["guidance"]["prior"] is None
-    assert "lambda_sds is 0" in started["guidance"]["reason"]
+    assert reason in started["guidance"]["reason"]
+    plan = json.loads((tmp_path / "run" / "config.json").read_text())["plan"]
+    assert plan["prior"] == {"name": None, "weight": 0.0, "reason": started["guidance"]["reason"]}
+
+
+@pytest.mark.usefixtures("embedded")
+@pytest.mark.parametrize("views", [4, 6, 8])
+def test_a_run_that_nobody_asked_to_guide_has_the_bits_of_lambda_0(views: int, tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "scene", train=views)
+    for name, guidance in (("default", GuidanceConfig()), ("zero", GuidanceConfig(lambda_sds=0.0))):
+        train(tiny_config(data, guidance=guidance), tmp_path / name)
+    default, zero = ((tmp_path / name / "splat.ply").read_bytes() for name in ("default", "zero"))
+    assert default == zero
 
 
 def test_words_of_a_run_that_was_broken_off_do_not_guide_the_next_one(

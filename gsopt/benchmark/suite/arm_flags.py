@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from gsopt import check
 
+GUIDED = ("--lambda-sds", "0.2")
+UNGUIDED = ("--lambda-sds", "0")
 PUBLISHED_SETTINGS = (
-    *("--lambda-sds", "0"),
+    *UNGUIDED,
     *("--sparse.below-views", "0"),
     *("--init", "random"),
     *("--init-count", "100000"),
@@ -23,14 +25,14 @@ learning rates, full resolution from the first step, no regularizer for few view
 
 ARMS: dict[str, tuple[str, ...]] = {
     "3dgs": PUBLISHED_SETTINGS,
-    "ours-0": ("--lambda-sds", "0"),
-    "ours": (),
-    "ours-user": (),
-    "ours-template": (),
-    "ours-llm": (),
+    "ours-0": UNGUIDED,
+    "ours": GUIDED,
+    "ours-user": GUIDED,
+    "ours-template": GUIDED,
+    "ours-llm": GUIDED,
 }
-"""3dgs: published settings; ours-0: ours without guidance; ours: the default, guided without prompts; the others:
-guided with prompts of the user, of the template, of a language model."""
+"""3dgs: published settings; ours-0: gsopt's defaults, unguided; ours: guided without prompts; the others: guided with
+prompts of the user, of the template, of a language model. The guard checks all guidance."""
 
 PROMPT_SOURCES = {"ours-user": "user", "ours-template": "template", "ours-llm": "llm:"}
 """Arms guided with prompts, and the prefix of their prompts' `source` in prompts.json."""
@@ -38,7 +40,7 @@ PROMPT_SOURCES = {"ours-user": "user", "ours-template": "template", "ours-llm": 
 
 def is_guided(arm: str) -> bool:
     """True when a diffusion prior may guide this arm."""
-    return not {"--lambda-sds", "--lambda_sds"} & set(ARMS[arm])
+    return ARMS[arm] == GUIDED
 
 
 def require(arms: tuple[str, ...]) -> None:

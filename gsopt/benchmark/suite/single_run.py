@@ -26,7 +26,7 @@ from gsopt.metrics import find_vgg_weights
 from gsopt.results.evaluation import read_metrics
 from gsopt.results.finished_run import open_run
 from gsopt.sds.prompts import read_set, write_prompts
-from gsopt.sds.select_prior import EMBEDDED, restrict_to_scene, select_prior
+from gsopt.sds.select_prior import EMBEDDED, embedded_prior_obstacle
 
 MAX_ERROR_LINES = 12
 """Number of last lines of a failed run's output in its error."""
@@ -56,16 +56,12 @@ def reason_to_skip(case: Case, context: SuiteContext) -> str | None:
     """Reason to skip a run, or None for a run to execute."""
     if not arm_flags.is_guided(case.arm):
         return None
-    config = GuidanceConfig(prior=context.prior or "auto")
-    choice = select_prior(config)
-    if choice.prior is not None and not context.prior:
-        views = load_scene(data_config(case, context.root))
-        choice = restrict_to_scene(choice, config, len(views.train), views.has_alpha)
-    if choice.prior is None:
-        return f"the same as ours-0, not guided: {choice.reason}"
+    missing = None if context.prior else embedded_prior_obstacle()
+    if missing is not None:
+        return f"the same as ours-0, not guided: no prior at hand: {missing}"
     if case.arm not in arm_flags.PROMPT_SOURCES:
         return None
-    return _reason_without_prompts(case, context, choice.prior)
+    return _reason_without_prompts(case, context, context.prior or "embedded")
 
 
 def _reason_without_prompts(case: Case, context: SuiteContext, prior: str) -> str | None:

@@ -70,8 +70,8 @@ def main(argv: Sequence[str]) -> int:
     from gsopt.training.loop import one_torch_thread
 
     choice = select_prior(config.guidance)
-    assert choice.prior is not None  # a weight was given: a prior that is not there is an error
-    prior = open_prior(choice.prior, config.guidance)
+    assert choice.name is not None  # a weight was given: a prior that is not there is an error
+    prior = open_prior(choice.name, config.guidance)
     report(f"prior {prior.name}")
     with one_torch_thread():
         scene = load_scene(config.data)

@@ -13,7 +13,7 @@ from gsopt.raster.backend import Backend
 from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.guidance_step import Guidance, GuidanceSetup
 from gsopt.sds.load_prior import open_prior
-from gsopt.sds.select_prior import restrict_to_scene, select_prior
+from gsopt.sds.select_prior import select_prior
 from gsopt.training.guided.guard import Verdict, evaluate_guidance
 from gsopt.training.guided.references import (
     CONDITIONING,
@@ -45,9 +45,8 @@ def start_guidance(
     """
     recorded = directory.recorded("guidance")
     if recorded is None:
-        choice = restrict_to_scene(select_prior(config.guidance), config.guidance, len(scene.train), scene.has_alpha)
-        recorded = {"prior": choice.prior, "lambda_sds": choice.weight, "reason": choice.reason}
-        if choice.prior is None:
+        recorded = {"prior": plan.prior.name, "lambda_sds": plan.prior.weight, "reason": plan.prior.reason}
+        if plan.prior.name is None:
             directory.record(guidance=recorded)
     if recorded["prior"] is None:
         return None
