@@ -55,6 +55,18 @@ def capped_psnr(
     return psnr(rendered, truth).clamp(max=cap)
 
 
+def object_psnr(
+    rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"], alphas: Float[Tensor, "B H W"]
+) -> Float[Tensor, "B"]:
+    """`capped_psnr` over the object: squared errors are weighted by the alpha (0..1) of the truth, so that an empty
+    background neither counts nor helps. NaN where the alpha is 0 everywhere."""
+    _check_pair(rendered, truth)
+    check.shape("alphas", alphas, tuple(rendered.shape[:3]))
+    squared = (rendered.double() - truth.double()).square().mean(dim=3)
+    mse = (squared * alphas).sum(dim=(1, 2)) / alphas.double().sum(dim=(1, 2))
+    return (20 * torch.log10(1 / mse.sqrt())).clamp(max=PSNR_CAP)
+
+
 def ssim(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
     """Structural similarity (Wang et al. 2004) of gsopt/raster/ssim.py, mean over pixels and channels."""
     _check_pair(rendered, truth)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsopt import metrics
 from gsopt.errors import InputError, UsageError
-from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, psnr, ssim
+from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, object_psnr, psnr, ssim
 
 LPIPS_TOLERANCE = 5e-5
 """Weights rounded to float16 move the distance by at most 3e-5 (measured against float32)."""
@@ -195,3 +195,17 @@ def test_the_variable_decides_where_vgg_is_looked_for(tmp_path: Path, monkeypatc
     present.write_bytes(b"")
     monkeypatch.setenv(metrics.VGG_VARIABLE, str(present))
     assert metrics.find_vgg_weights() == present
+
+
+def test_object_psnr_counts_pixels_by_their_alpha() -> None:
+    """Errors outside the mask do not count, and a larger empty background changes nothing."""
+    generator = torch.Generator().manual_seed(4)
+    truth, rendered = (torch.rand(2, 12, 12, 3, generator=generator) for _ in range(2))
+    alphas = torch.zeros(2, 12, 12)
+    alphas[:, 3:9, 2:8] = 1
+    inside = object_psnr(rendered, truth, alphas)
+    torch.testing.assert_close(inside, psnr(rendered[:, 3:9, 2:8], truth[:, 3:9, 2:8]))
+    noisy = torch.where(alphas[..., None] > 0, rendered, 1 - rendered)
+    assert torch.equal(object_psnr(noisy, truth, alphas), inside)
+    halved = object_psnr(rendered, truth, alphas / 2)
+    torch.testing.assert_close(halved, inside)

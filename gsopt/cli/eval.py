@@ -63,6 +63,8 @@ def summary(metrics: dict[str, Any]) -> str:
 def _figures(mean: dict[str, float | None]) -> str:
     columns = {"psnr": ("PSNR", ".2f", " dB"), "ssim": ("SSIM", ".4f", "")}
     columns |= {"lpips_alex": ("LPIPS (Alex)", ".4f", ""), "lpips_vgg": ("LPIPS (VGG)", ".4f", "")}
+    if mean.get("psnr_object") is not None:
+        columns["psnr_object"] = ("PSNR inside the masks", ".2f", " dB")
     parts = []
     for key, (title, digits, unit) in columns.items():
         value = mean[key]

@@ -47,7 +47,9 @@ def summary(metrics: Mapping[str, Any]) -> str:
     held_out = metrics["mean"] is not None
     judged = metrics if held_out else metrics["train"]
     names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips_alex": "LPIPS {:.4f}"}
-    figures = [text.format(judged["mean"][name]) for name, text in names.items() if judged["mean"][name] is not None]
+    names["psnr_object"] = "{:.2f} dB inside the masks"
+    mean = judged["mean"]
+    figures = [text.format(mean[name]) for name, text in names.items() if mean.get(name) is not None]
     count = len(judged["per_view"])
     whose = f"{count} held-out view{'s' * (count != 1)}" if held_out else "input views (none was held out)"
     memory = "" if metrics["peak_memory_mb"] is None else f", peak memory {metrics['peak_memory_mb']:.0f} MB"

@@ -30,6 +30,7 @@ from gsopt.errors import SettingError, UsageError
 
 FLAGS = {
     "iterations": "--iterations N",
+    "data.masks": "--masks given|none|DIR",
     "data.views": "--views N",
     "data.view_ids": "--view-ids I,J,...",
     "data.downscale": "--resolution -r",
@@ -58,7 +59,8 @@ class Flags:
     """Learn Gaussians from the posed images in DATA and write splats, metrics and a report to a run directory."""
 
     data: Annotated[Positional[Path | None], arg(metavar="DATA")] = None
-    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp or COLMAP; or photos or a video (see gsopt sfm)."""
+    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp, COLMAP, LLFF or IDR; or photos or a video (see gsopt
+    sfm)."""
     source_path: Annotated[Path | None, arg(aliases=["-s"], metavar="DATA")] = None
     """The same as DATA, for those who know Inria's train.py."""
     run: Annotated[Path | None, arg(aliases=["-m", "--model-path"], metavar="RUN")] = None

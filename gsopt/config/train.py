@@ -33,7 +33,8 @@ class DataConfig:
     """The dataset, and the views of it that a run learns from and is evaluated on."""
 
     path: str = ""
-    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp or COLMAP; or photos or a video (see gsopt sfm)."""
+    """Dataset folder: NeRF-synthetic, nerfstudio/instant-ngp, COLMAP, LLFF or IDR; or photos or a video (see gsopt
+    sfm)."""
     views: PositiveCount | None = None
     """Number of input views to learn from, well spread by camera position; all by default."""
     view_ids: tuple[int, ...] | None = None
@@ -46,6 +47,9 @@ class DataConfig:
     """Color behind transparent pixels. random draws one per step and evaluates on white."""
     cache_mb: Count = 2048
     """Decoded images kept in memory, MB; the rest is read again when needed."""
+    masks: str = "given"
+    """Masks of the object: given (alpha or the dataset's own folder), none (no mask files), or a folder with a mask
+    named like each image."""
 
     @property
     def evaluation_background(self) -> tuple[float, float, float]:

@@ -17,7 +17,6 @@ from torch import Tensor
 from gsopt.data import files
 from gsopt.data.colmap_files import CameraRecord, ImageRecord, read_cameras, read_images, read_points
 from gsopt.data.lens import Lens
-from gsopt.data.masks import find_mask
 from gsopt.data.posed_images import Dataset, PosedImage, check_enough, check_pose, summarize_names
 from gsopt.errors import InputError
 
@@ -91,9 +90,6 @@ def _frames(
             f"{path.name} poses {len(records)} images, {len(absent)} of them are absent from images/ and left out: "
             f"{summarize_names(absent)}."
         )
-    unmasked = [frame.name for frame in frames if frame.mask is None]
-    if (root / "masks").is_dir() and unmasked:
-        warnings.append(f"masks/ has no mask for {len(unmasked)} of {len(frames)} images: {summarize_names(unmasked)}.")
     return frames
 
 
@@ -104,8 +100,7 @@ def _frame(root: Path, record: ImageRecord, camera: CameraRecord, image: Path, w
     check_pose(viewmat, where)
     K, lens = _camera_model(camera, where)
     name = files.relative_name(image, root)
-    mask = find_mask(root / "masks", record.name) if (root / "masks").is_dir() else None
-    return PosedImage(name, image, mask, viewmat, K, camera.width, camera.height, lens, position)
+    return PosedImage(name, image, None, viewmat, K, camera.width, camera.height, lens, position)
 
 
 def _rotation(quat: tuple[float, float, float, float], where: str) -> Float[Tensor, "3 3"]:

@@ -124,15 +124,20 @@ def read_pixels(path: Path) -> UInt8[Tensor, "H W C"]:
         return _decode(image, "RGBA" if _has_alpha(image) else "RGB", path)
 
 
+def check_mask_size(path: Path, got: tuple[int, int], size: tuple[int, int]) -> None:
+    """InputError unless a mask has the aspect of its image; sizes are (width, height)."""
+    if abs(got[0] * size[1] - got[1] * size[0]) > max(*got, *size):
+        raise InputError(
+            f"The mask {path} is {got[0]}x{got[1]}, but its image is {size[0]}x{size[1]}: another aspect. "
+            "Export the mask again for this image."
+        )
+
+
 def read_gray(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "H W"]:
     """Decode to one channel of `size`; another size is box-filtered to it when the aspect agrees, else InputError."""
     with _open(path, channels=1) as image:
         width, height = image.size
-        if abs(width * size[1] - height * size[0]) > max(width, height, *size):
-            raise InputError(
-                f"The mask {path} is {width}x{height}, but its image is {size[0]}x{size[1]}: another aspect. "
-                "Export the mask again for this image."
-            )
+        check_mask_size(path, (width, height), size)
         gray = _decode(image, "L", path)
     if (width, height) == size:
         return gray[..., 0]

@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from gsopt.data import files
 from gsopt.data.lens import Lens
 from gsopt.errors import InputError
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MAX_NAME = 255
 """Characters of a name in a warning."""
 RIGID_TOLERANCE = 1e-3
@@ -81,6 +83,16 @@ def read_pose(record: dict[str, Any], key: str, where: str) -> Float[Tensor, "4 
     pose = torch.tensor([*values, [0.0, 0.0, 0.0, 1.0]][:4], dtype=torch.float64)
     check_pose(pose, where)
     return pose
+
+
+def images_in_order(folder: Path) -> list[Path]:
+    """The image files of a folder in name order, for datasets that pair them with cameras by position. InputError
+    without any."""
+    found = sorted(folder.iterdir(), key=lambda path: path.name) if folder.is_dir() else []
+    images = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES and files.is_regular(path)]
+    if not images:
+        raise InputError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}). Put the dataset's images there.")
+    return images
 
 
 def check_enough(frames: list[PosedImage], absent: list[str], path: Path) -> None:

@@ -14,7 +14,10 @@ from torch import Tensor
 from gsopt.config.train import DataConfig
 from gsopt.data import files
 from gsopt.data.colmap import find_model, read_colmap
-from gsopt.data.images import ImageSource, ImageStore, read_header, size_mismatch
+from gsopt.data.idr import CAMERAS, read_idr
+from gsopt.data.images import ImageSource, ImageStore, check_mask_size, read_header, size_mismatch
+from gsopt.data.llff import POSES, read_llff
+from gsopt.data.masks import with_masks
 from gsopt.data.posed_images import Dataset, PosedImage
 from gsopt.data.resample import downscaled_size
 from gsopt.data.split import split
@@ -74,7 +77,7 @@ class Scene:
 
     path: Path
     kind: str
-    """nerf-synthetic, nerfstudio or colmap."""
+    """nerf-synthetic, nerfstudio, colmap, llff or idr."""
     train: tuple[View, ...]
     """Input views, after `--views` or `--view-ids` picked them."""
     test: tuple[View, ...]
@@ -117,7 +120,7 @@ class Scene:
 
 
 def load_scene(config: DataConfig | str | Path) -> Scene:
-    """Read a NeRF-synthetic, nerfstudio/instant-ngp or COLMAP folder; a path stands for `DataConfig(path=...)`.
+    """Read a folder with a COLMAP model or one of the files in READERS; a path stands for `DataConfig(path=...)`.
 
     Images are opened for their size only; pixels are read on demand. Raises InputError for anything wrong with
     the folder and UsageError for `--views` and `--view-ids` that do not fit it.
@@ -125,7 +128,7 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     if not isinstance(config, DataConfig):
         config = DataConfig(path=str(config))
     root = Path(config.path).expanduser()
-    dataset = read_dataset(root)
+    dataset = with_masks(read_dataset(root), root, config.masks)
     if not dataset.frames:
         raise InputError(f"{root} has no input view whose image exists. Restore the images, or give another folder.")
     train, test = split(dataset, config)
@@ -146,11 +149,18 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     )
 
 
+READERS = {
+    "transforms_train.json": read_transforms,
+    "transforms.json": read_transforms,
+    POSES: read_llff,
+    CAMERAS: read_idr,
+}
+"""Readers by the file that recognizes a dataset, in order; a COLMAP model comes before all."""
+
+
 def is_posed(root: Path) -> bool:
     """True when a folder holds a dataset with poses, by the names of its files."""
-    return find_model(root) is not None or any(
-        files.is_regular(root / name) for name in ("transforms_train.json", "transforms.json")
-    )
+    return find_model(root) is not None or any(files.is_regular(root / name) for name in READERS)
 
 
 def read_dataset(root: Path) -> Dataset:
@@ -161,12 +171,13 @@ def read_dataset(root: Path) -> Dataset:
         )
     if find_model(root) is not None:
         return read_colmap(root)
-    if files.is_regular(root / "transforms_train.json") or files.is_regular(root / "transforms.json"):
-        return read_transforms(root)
+    for name, read in READERS.items():
+        if files.is_regular(root / name):
+            return read(root)
     raise InputError(
         f"{root} holds no posed dataset. Looked for sparse/0 or sparse with cameras, images and points3D as .bin or "
-        ".txt (COLMAP), transforms_train.json (NeRF-synthetic) and transforms.json (nerfstudio, instant-ngp). "
-        "Photos alone have no poses yet: find them with `gsopt sfm`."
+        f".txt (COLMAP), transforms_train.json (NeRF-synthetic), transforms.json (nerfstudio, instant-ngp), {POSES} "
+        f"(LLFF) and {CAMERAS} (IDR, NeuS). Photos alone have no poses yet: find them with `gsopt sfm`."
     )
 
 
@@ -215,6 +226,8 @@ def _prepare(
         K = undistortion.pinhole
     if path != frame.path:
         width, height = stored
+    if frame.mask is not None:
+        check_mask_size(frame.mask, read_header(frame.mask)[:2], stored)
     image = ImageSource(path, frame.mask, stored, undistortion, width, height)
     alpha = frame.mask is not None or read_header(path)[2]
     return image, _resized(K, stored, (width, height)), alpha

@@ -16,7 +16,6 @@ from torch import Tensor
 from gsopt.data import files
 from gsopt.data.images import read_header
 from gsopt.data.lens import Lens
-from gsopt.data.masks import find_mask
 from gsopt.data.pointcloud import read_points_ply
 from gsopt.data.posed_images import Dataset, PosedImage, check_enough, read_pose, summarize_names
 from gsopt.errors import InputError
@@ -94,8 +93,6 @@ def _frame(
             names = summarize_names([entry["mask_path"]]), summarize_names([entry["file_path"]])
             warnings.append(f"The mask {names[0]} of {names[1]} is absent; the image is used unmasked.")
             mask = None
-    elif (path.parent / "masks").is_dir():
-        mask = find_mask(path.parent / "masks", _inside_images(entry["file_path"], image))
     return PosedImage(
         name=files.relative_name(image, path.parent),
         path=image,
@@ -107,12 +104,6 @@ def _frame(
         lens=_lens(values, where),
         position=position,
     )
-
-
-def _inside_images(file_path: str, image: Path) -> str:
-    """The image's name below `images/`, as mask folders mirror it."""
-    parts = Path(file_path.replace("\\", "/")).parent.parts
-    return Path(*parts[1:], image.name).as_posix() if parts and parts[0] == "images" else image.name
 
 
 def _size(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:

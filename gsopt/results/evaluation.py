@@ -17,13 +17,15 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
 from gsopt.events import LARGEST_METRICS, refuse_links, to_json, write_atomic
 from gsopt.gaussians import Gaussians
-from gsopt.metrics import PSNR_CAP, VGG_NOTE, Lpips, capped_psnr, find_vgg_weights, ssim
+from gsopt.metrics import PSNR_CAP, VGG_NOTE, Lpips, capped_psnr, find_vgg_weights, object_psnr, ssim
 from gsopt.raster.backend import Backend, RasterSettings
 from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
 from gsopt.results.video import safe_name, save_stills
 
 MAX_TRAIN_VIEWS = 16
 """Input views to evaluate, evenly spread, when none is held out."""
+METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "psnr_object")
+"""Metrics of a view; the last only where it has alpha."""
 METRIC_DIGITS = 6
 """Decimals of a metric; further ones depend on the number of torch's threads."""
 
@@ -55,7 +57,9 @@ def evaluate_views(
     per_view: list[dict[str, Any]] = []
     for index, view in enumerate(views):
         render = draw(gaussians, view.camera, backend, settings, background)
-        row: dict[str, Any] = {"name": view.name, **_image_metrics(render, truth(view, background), networks)}
+        seen = truth(view, background)
+        row: dict[str, Any] = {"name": view.name, **_image_metrics(render, seen, networks)}
+        row |= _object_metrics(render, seen, view)
         if save_dir is not None:
             (path,) = save_stills(save_dir, [(safe_name(index, view.name), render)], overwrite=True)
             row["render"] = path.name
@@ -81,11 +85,24 @@ def _image_metrics(
     return {name: None if value is None else round(value, METRIC_DIGITS) for name, value in values.items()}
 
 
+def _object_metrics(
+    render: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], view: View
+) -> dict[str, float | None]:
+    """`psnr_object`: PSNR inside the mask; {} for a view without alpha, None where the alpha is empty."""
+    pixels = view.pixels()
+    if pixels.shape[2] == 3:
+        return {}
+    a, b, alphas = (image[None].float() / 255 for image in (render, target, pixels[..., 3]))
+    value = object_psnr(a, b, alphas).item() if bool(alphas.any()) else None
+    return {"psnr_object": None if value is None else round(value, METRIC_DIGITS)}
+
+
 def _mean(per_view: list[dict[str, Any]]) -> dict[str, float | None] | None:
     """Mean of each metric over views (None when some view lacks it), or None without views."""
     if not per_view:
         return None
-    columns = {key: [row[key] for row in per_view] for key in ("psnr", "ssim", "lpips_alex", "lpips_vgg")}
+    keys = [key for key in METRICS if all(key in row for row in per_view)]
+    columns = {key: [row[key] for row in per_view] for key in keys}
     return {
         key: None if any(value is None for value in column) else round(sum(column) / len(column), METRIC_DIGITS)
         for key, column in columns.items()
@@ -179,7 +196,8 @@ def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> s
     evaluated = len(results["per_view"]) or len(results["train"]["per_view"])
     background = {"random": "white (trained on random)"}.get(finished.config.data.background)
     return (
-        "PSNR per image then mean; SSIM 11x11 sigma 1.5 zero padding; LPIPS v0.1 Alex and VGG, inputs mapped to [-1,1] "
+        "PSNR per image then mean; psnr_object inside the truth's alpha; SSIM 11x11 sigma 1.5 zero padding; "
+        "LPIPS v0.1 Alex and VGG, inputs mapped to [-1,1] "
         "(the Inria code feeds VGG [0,1] unscaled, which gives other values); renders and truths rounded to 8 bit as "
         f"the field does; equal images count as {PSNR_CAP:g} dB; background "
         f"{background or finished.config.data.background}; split: trained on {len(scene.train)} views, held out "

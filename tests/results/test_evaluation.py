@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.results import evaluation
 from gsopt.results.evaluation import evaluate, evaluate_views
-from gsopt.results.finished_run import truth
+from gsopt.results.finished_run import open_run, truth
 
 
 @pytest.fixture(scope="module")
@@ -204,3 +205,29 @@ def test_fields_that_cannot_be_kept_are_an_input_error_before_the_work(tmp_path:
             evaluate(run, vgg=False)
         errors.append(str(error.value))
     assert "strict JSON" in errors[0]
+
+
+class OneImage:
+    """A store of one image."""
+
+    def __init__(self, pixels: torch.Tensor) -> None:
+        self.pixels = pixels
+
+    def get(self, index: int) -> torch.Tensor:
+        return self.pixels
+
+
+@pytest.mark.parametrize(("alpha", "expected"), [(None, "absent"), (0, None), (255, PSNR_CAP)])
+def test_the_object_is_measured_where_a_view_has_alpha(
+    perfect: Path, alpha: int | None, expected: float | str | None
+) -> None:
+    """Nothing is claimed about an object that no mask shows."""
+    run = open_run(perfect)
+    view = load_scene(run.config.data).test[0]
+    pixels = view.pixels()[..., :3]
+    if alpha is not None:
+        pixels = torch.cat([pixels, torch.full_like(pixels[..., :1], alpha)], dim=2)
+    masked = replace(view, store=OneImage(pixels), index=0)
+    drawn = evaluate_views(run.gaussians, [masked], run.backend, run.settings, run.background, None, vgg=False)
+    assert drawn["per_view"][0].get("psnr_object", "absent") == expected
+    assert drawn["mean"].get("psnr_object", "absent") == expected

@@ -19,8 +19,10 @@ NO_VALUE = "\N{EN DASH}"
 """Replaces a missing value."""
 TURNTABLE_FPS = 12.0
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (Alex)", "lpips_vgg": "LPIPS (VGG)"}
-HINTS = {"psnr": "dB, higher is better", "ssim": "higher is better"}
-DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
+OBJECT_TITLES = {"psnr_object": "PSNR of the object"}
+"""Metrics inside masks, shown where the views have some."""
+HINTS = {"psnr": "dB, higher is better", "ssim": "higher is better", "psnr_object": "dB inside the masks"}
+DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4, "psnr_object": 2}
 # The page loads nothing: images are data URIs, styles are inline, and there are no scripts.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
@@ -76,7 +78,7 @@ def _scope(report: Report) -> str:
 
 
 def _tiles(report: Report) -> Iterable[str]:
-    for key, title in TITLES.items():
+    for key, title in titles(report).items():
         yield _tile(title, figure(key, report.mean.get(key)), HINTS.get(key, "lower is better"))
     yield _tile("Gaussians", NO_VALUE if report.n_gaussians is None else f"{report.n_gaussians:,}", "")
     seconds = number(report.metrics.get("train_seconds"))
@@ -88,6 +90,12 @@ def _tiles(report: Report) -> Iterable[str]:
     memory = number(report.metrics.get("peak_memory_mb"))
     if memory is not None:
         yield _tile("Peak memory", f"{memory:,.0f}", "MB")
+
+
+def titles(report: Report) -> dict[str, str]:
+    """Titles of the metrics that this run has."""
+    inside = {key: title for key, title in OBJECT_TITLES.items() if report.mean.get(key) is not None}
+    return TITLES | inside
 
 
 def _tile(title: str, value: str, hint: str | None) -> str:
@@ -132,7 +140,9 @@ def _card(view: EvaluatedView) -> str:
     )
     badge = f'<span class="badge {view.badge}">{view.badge}</span>' if view.badge else ""
     figures = " · ".join(
-        f"{TITLES[key]} {figure(key, value)}" for key, value in view.figures.items() if value is not None
+        f"{(TITLES | OBJECT_TITLES)[key]} {figure(key, value)}"
+        for key, value in view.figures.items()
+        if value is not None
     )
     return (
         f'<article class="card"><div class="triple">{figures_html}</div>'
@@ -141,10 +151,11 @@ def _card(view: EvaluatedView) -> str:
 
 
 def _table(report: Report) -> str:
-    head = "".join(f'<th scope="col">{title}</th>' for title in ("View", *TITLES.values()))
+    shown = titles(report)
+    head = "".join(f'<th scope="col">{title}</th>' for title in ("View", *shown.values()))
     rows = "".join(
         f'<tr><th scope="row">{escape(row["name"])}</th>'
-        + "".join(f"<td>{figure(key, row[key])}</td>" for key in TITLES)
+        + "".join(f"<td>{figure(key, row[key])}</td>" for key in shown)
         + "</tr>"
         for row in report.per_view
     )

@@ -16,7 +16,7 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import GsoptError
 from gsopt.events import LARGEST_METRICS, read_events
 from gsopt.geometry.cameras import Cameras
-from gsopt.results.evaluation import evenly_spread
+from gsopt.results.evaluation import METRICS, evenly_spread
 from gsopt.results.finished_run import FinishedRun, camera_path, open_run, truth, with_longest_side
 from gsopt.results.report.cameras_section import cameras_section
 from gsopt.results.report.embedded_images import shrunk
@@ -29,7 +29,6 @@ EXTREME_VIEWS = 4
 MAX_INPUT_VIEWS = 24
 TURNTABLE_FRAMES = 36
 TURNTABLE_SIDE = 400
-METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
 
 
 @dataclass(frozen=True)
