@@ -43,6 +43,10 @@ bench: $(VENV)/.for-test
 stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
+# Every call that changes the disk is made to fail once, in every way: killed, full, broken, half written. Two hours.
+every-write: $(VENV)/.for-test
+	OMP_NUM_THREADS=1 GSOPT_EVERY_WRITE=full $(PY) -m pytest tests/every_write
+
 # The tests that run kernels, on a build that stops at the first bad address or undefined behavior. -O1 halves the time to
 # compile; tests of the reference alone have no kernel to check. -S and -P: neither the editable install nor the sources are
 # imported instead of the build; --capture=sys leaves a sanitizer's report visible.

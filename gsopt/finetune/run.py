@@ -34,6 +34,7 @@ from gsopt.sds.priors.view_conditioned import (
     zero_text_attention,
 )
 from gsopt.sds.select_prior import EMBEDDED
+from gsopt.training.run_directory import sweep
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""
@@ -60,6 +61,7 @@ def finetune(
     that holds something else.
     """
     _claim_folder(out, scenes, config, base)
+    sweep(out, *(path for path in out.iterdir() if path.is_dir() and not path.is_symlink()))
     train, val = (_library(paths, scenes, out / "pairs", backend, report) for paths in (scenes.train, scenes.val))
     assert train is not None
     held = 0 if val is None else len(val.pairs)

@@ -211,6 +211,8 @@ def few_photo_warnings(scene: Scene) -> tuple[str, ...]:
 def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:
     """Step until the end; True when asked to stop before it."""
     plan = trainer.plan
+    if trainer.step > 0 and is_due(trainer.step, plan.preview_every) and not _preview_path(trainer, directory).exists():
+        _preview(trainer, directory)  # the disk refused it, then took the checkpoint
     while not trainer.finished:
         if stop:
             return True
@@ -253,9 +255,13 @@ def _save(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
 def _preview(trainer: Trainer, directory: RunDirectory) -> None:
     """The splats so far: written, closed, then announced."""
     _check_finite(trainer, directory)
-    path = directory.previews / f"step_{trainer.step:06d}.ply"
+    path = _preview_path(trainer, directory)
     save_ply(path, trainer.model.gaussians, antialiased=trainer.plan.antialiased)
     directory.emit("preview", step=trainer.step, path=path.relative_to(directory.path).as_posix())
+
+
+def _preview_path(trainer: Trainer, directory: RunDirectory) -> Path:
+    return directory.previews / f"step_{trainer.step:06d}.ply"
 
 
 def _report_progress(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:

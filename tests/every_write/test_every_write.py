@@ -1,0 +1,194 @@
+"""The k-th change of the disk fails, for every k: killed, full, broken, half written. Resumed, nothing is missing.
+
+An ordinary run of the tests takes a sample of the k; GSOPT_EVERY_WRITE=full takes every one (`make every-write`).
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import textured_room as room
+from faulty_disk import FAULTS, Fault, FaultyDisk, compiler, faulty_disk
+from tiny_scenes import cloud, write_dataset
+
+from gsopt.events import read_events
+from gsopt.formats import load_splats, save_splats
+from gsopt.training.checkpoint import load_newest
+from gsopt.training.run_directory import TEMPORARY
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="needs Linux and a C compiler")
+
+SAMPLED = 12
+"""Calls at which a work is made to fail in an ordinary run; a slow one, which then is left out, in a full one."""
+FULL = os.environ.get("GSOPT_EVERY_WRITE") == "full"
+CHECKPOINT_EVERY = 7
+Files = dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Work:
+    """A command that writes into a folder, the command that goes on with it, and what must be the same afterwards."""
+
+    arguments: Callable[[Path], list[str]]
+    resume: Callable[[Path], list[str]]
+    """What is added to go on; none for the same command again."""
+    products: Callable[[Path], Files]
+    prepare: Callable[[Path], None]
+    check: Callable[[Path], None]
+    """What holds right after the fault, before anything is resumed."""
+    slow: bool = False
+
+
+def same_command(folder: Path) -> list[str]:
+    """Adds nothing."""
+    return []
+
+
+def named(*patterns: str) -> Callable[[Path], Files]:
+    """Reads the files of these names."""
+    return lambda folder: {
+        str(path.relative_to(folder)): path.read_bytes() for name in patterns for path in sorted(folder.glob(name))
+    }
+
+
+def nothing(folder: Path) -> None:
+    """Holds of any folder."""
+
+
+def no_step_is_lost(folder: Path) -> None:
+    """The newest checkpoint is no further back than the run said when it announced its progress."""
+    log = folder / "run" / "events.jsonl"
+    events = read_events(log)[0] if log.exists() else []
+    reached = max((event.get("step", 0) for event in events if event["kind"] != "done"), default=0)
+    due = (reached - 1) // CHECKPOINT_EVERY * CHECKPOINT_EVERY
+    if due > 0 and not any(event["kind"] == "error" for event in events):
+        checkpoint = load_newest(folder / "run" / "checkpoints", pytest.fail)
+        assert checkpoint is not None
+        assert int(checkpoint.path.stem.removeprefix("step_")) >= due
+
+
+def old_or_new(folder: Path) -> None:
+    """An exported file that was there before is the old one or the new one."""
+    assert len(load_splats(folder / "out.spz")) in (5, 40)
+
+
+def whole_or_absent(folder: Path) -> None:
+    """A posed scene is there with its last file, or not at all."""
+    assert not (folder / "scene").exists() or (folder / "scene" / "sfm.json").exists()
+
+
+def works(inputs: Path) -> dict[str, Work]:
+    scenes, photos, splats = inputs / "scenes", inputs / "photos", inputs / "splats.ply"
+    finetune = shlex.split("--val two --fits 1 --size 64 --steps 2 --batch 2 --threads 1")
+    train = shlex.split("--init random --init-count 60 --iterations 20 --preview-every 5 --lambda-sds 0 --threads 1")
+    train += ["--checkpoint-every", str(CHECKPOINT_EVERY)]
+    return {
+        "train": Work(
+            lambda folder: ["train", str(scenes / "one"), "-m", str(folder / "run"), *train],
+            lambda folder: ["--resume"],
+            named("run/splat.ply", "run/previews/*", "run/renders/test/*"),
+            nothing,
+            no_step_is_lost,
+        ),
+        "export": Work(
+            lambda folder: ["export", str(splats), "-o", str(folder / "out.spz"), "--force"],
+            same_command,
+            named("out.spz"),
+            lambda folder: save_splats(folder / "out.spz", cloud(5, seed=0)),
+            old_or_new,
+        ),
+        "sfm": Work(
+            lambda folder: ["sfm", str(photos), "-o", str(folder / "scene"), "--threads", "1"],
+            same_command,
+            named("scene/transforms.json", "scene/points.ply", "scene/images/*"),
+            nothing,
+            whole_or_absent,
+            slow=True,
+        ),
+        "finetune": Work(
+            lambda folder: ["finetune", str(scenes), "-o", str(folder / "prior"), *finetune],
+            same_command,
+            named("prior/unet/*"),
+            nothing,
+            nothing,
+            slow=True,
+        ),
+    }
+
+
+NAMES = ("train", "export", "sfm", "finetune")
+
+
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultyDisk]:
+    with faulty_disk(tmp_path_factory.mktemp("library")) as disk:
+        yield disk
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    save_splats(folder / "splats.ply", cloud(40, seed=0))
+    write_dataset(folder / "scenes" / "one", train=6)
+    if FULL:
+        write_dataset(folder / "scenes" / "two", train=6)
+        room.photograph(folder / "photos", room.arc(5))
+    return folder
+
+
+def faults_of(calls: int, every: bool) -> Iterator[tuple[int, Fault]]:
+    """Every call with every fault, or a sample in which every fault occurs."""
+    if every:
+        yield from ((at, fault) for at in range(1, calls + 1) for fault in FAULTS)
+    else:
+        stride = max(calls // SAMPLED, 1)
+        yield from ((at, FAULTS[i % len(FAULTS)]) for i, at in enumerate(range(1, calls + 1, stride)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_work_survives_a_fault_at_any_write(name: str, disk: FaultyDisk, inputs: Path, tmp_path: Path) -> None:
+    work = works(inputs)[name]
+    if work.slow and not FULL:
+        pytest.skip("minutes: make every-write")
+    whole, whole_folder = fresh(tmp_path / "whole", work), tmp_path / "whole"
+    healthy = disk.run(work.arguments(whole), whole)
+    assert healthy.code == 0, disk.log.read_text()
+    assert healthy.calls > 3
+    products = work.products(whole_folder)
+    for at, fault in faults_of(healthy.calls, FULL and not work.slow):
+        survives(work, disk, fault, at, fresh(tmp_path / "faulty", work), products)
+
+
+def fresh(folder: Path, work: Work) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    work.prepare(folder)
+    return folder
+
+
+def survives(work: Work, disk: FaultyDisk, fault: Fault, at: int, folder: Path, products: Files) -> None:
+    """One fault: a clear end, nothing lost, and the same bytes once the command is given again."""
+    where = f"{fault} at call {at}"
+    outcome = disk.run(work.arguments(folder), folder, fault, at)
+    log = disk.log.read_text()
+    assert outcome.happened, where
+    allowed = {"kill": (-9,), "short": (0,)}.get(fault.kind, (0, 3))
+    assert outcome.code in allowed, f"{where}: exit code {outcome.code}\n{log}"
+    assert "Traceback" not in log, f"{where}\n{log}"
+    work.check(folder)
+    if work.products(folder) != products:
+        again = disk.run([*work.arguments(folder), *work.resume(folder)], folder)
+        assert again.code == 0, f"{where}, then resumed: {disk.log.read_text()}"
+    assert work.products(folder) == products, where
+    assert strays(folder) == [], where
+
+
+def strays(folder: Path) -> list[str]:
+    """Names of half-written files."""
+    return [str(path.relative_to(folder)) for path in folder.rglob("*") if TEMPORARY.fullmatch(path.name)]
