@@ -1,4 +1,4 @@
-"""The margins of cpu/reach.h: no pixel that a splat colors is skipped, and little is visited in vain."""
+"""The margins of common/reach.h: no pixel that a splat colors is skipped, and little is visited in vain."""
 
 from __future__ import annotations
 

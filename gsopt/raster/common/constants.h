@@ -3,6 +3,7 @@
 
 namespace gsopt {
 
+constexpr int kTile = 16;  // pixels along a tile's side
 constexpr float kAlphaMin = 1.f / 255.f;
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;

@@ -27,8 +27,7 @@ template <class F> struct Vec3 {
 };
 template <class F> inline Vec3<F> operator+(Vec3<F> a, Vec3<F> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <class F> inline Vec3<F> operator-(Vec3<F> a, Vec3<F> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-template <class F> inline Vec3<F> operator*(Vec3<F> a, F s) { return {a.x * s, a.y * s, a.z * s}; }
-template <class F> inline Vec3<F> operator*(Vec3<F> a, float s) { return {a.x * s, a.y * s, a.z * s}; }
+template <class F, class S> inline Vec3<F> operator*(Vec3<F> a, S s) { return {a.x * s, a.y * s, a.z * s}; }
 template <class F> inline F dot(Vec3<F> a, Vec3<F> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 template <class F> inline Vec3<F> cross(Vec3<F> a, Vec3<F> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
@@ -128,6 +127,25 @@ template <class F> inline Whitening<F> whitening(const Projected<F>& p) {
   return {A, splat<F>(0.f) - A * (p.xy / p.yy), splat<F>(1.f) / sqrt(p.yy)};
 }
 
+// The splat as it is blended, L in units in which its exponent of 2 is log2_opacity - u² - v² (8a), and the half-sides
+// of its box (6).
+template <class F> struct Ellipse {
+  F A, B, C, log2_opacity, reach_x, reach_y;
+};
+template <class F> inline Ellipse<F> ellipse(const Projected<F>& p) {
+  const Whitening<F> L = whitening(p);
+  const F lo = log2(max(p.opacity, splat<F>(1e-37f)));
+  const F reach = max(lo - kLog2AlphaMin, splat<F>(0.f)) / splat<F>(kHalfLog2E);
+  return {L.A * kSqrtHalfLog2E, L.B * kSqrtHalfLog2E, L.C * kSqrtHalfLog2E, lo, sqrt(reach * p.xx), sqrt(reach * p.yy)};
+}
+
+// Whether a splat is in the image: neither culled nor without area.
+template <class F> inline auto is_visible(const Camera& cam, const Projected<F>& p, const Ellipse<F>& e) {
+  return (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
+         (p.det < 1e37f) & (p.mx + e.reach_x > 0.f) & (p.mx - e.reach_x < static_cast<float>(cam.width)) &
+         (p.my + e.reach_y > 0.f) & (p.my - e.reach_y < static_cast<float>(cam.height));
+}
+
 // Moments of s = dLoss/d ln(alpha) over the splat's pixels, (11).
 template <class F> struct SplatGradient {
   F u, v, uu, uv, vv;  // Σ s u, ...
@@ -135,6 +153,16 @@ template <class F> struct SplatGradient {
   F mx, my;            // mean2d: Lᵀ (Σ s u, Σ s v)
   F depth;
 };
+
+// One row of gradient sums: moments of s in units of the ellipse, then color, depth, |gradient|.
+enum RowField { kS, kSu, kSv, kSuu, kSuv, kSvv, kWr, kWg, kWb, kWz, kAbsX, kAbsY, kRowFields };
+
+template <class F> inline SplatGradient<F> splat_gradient(const Whitening<F>& L, const F* row) {
+  constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;  // of what blending measures u and v in
+  const F su = row[kSu] * length, sv = row[kSv] * length;
+  return {su, sv, row[kSuu] * square, row[kSuv] * square, row[kSvv] * square, row[kS], L.A * su, L.B * su + L.C * sv,
+      row[kWz]};
+}
 
 // Equations (12) to (16).
 template <class F> inline Splat3D<F> project_backward(

@@ -31,6 +31,13 @@ template <class F> inline void sh_basis(int degree, F x, F y, F z, F* Y) {
   Y[14] = x * (xx - yy * 3.f) * -0.59004358992664352f;
 }
 
+// The unit vector from the camera to a mean at `offset` from the pivot.
+template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<F>& offset, F& inverse_distance) {
+  const Vec3<F> d = offset - splat3<F>(cam.center);
+  inverse_distance = splat<F>(1.f) / sqrt(max(dot(d, d), splat<F>(1e-30f)));
+  return d * inverse_distance;
+}
+
 // Their partial derivatives, of the same polynomials (x, y, z taken as independent): the gradients of (18).
 template <class F> inline void sh_basis_gradient(int degree, F x, F y, F z, Vec3<F>* out) {
   const F zero = x * 0.f;

@@ -10,20 +10,15 @@ namespace gsopt::GSOPT_ISA {
 // n numbers of a parameter from `begin` on, and their gradient `g`.
 inline void adam_span(const AdamArguments& a, const AdamParameter& of, int64_t begin, int64_t n, const float* g) {
   float *p = of.param + begin, *m = of.exp_avg + begin, *v = of.exp_avg_sq + begin;
-  const float d1 = 1.f - a.beta1, d2 = 1.f - a.beta2;
   int64_t i = 0;
   for (; i + kWide <= n; i += kWide) {
-    const wide grad = load_wide(g + i), mean = load_wide(m + i) * a.beta1 + grad * d1,
-               square = load_wide(v + i) * a.beta2 + grad * grad * d2;
+    wide param = load_wide(p + i), mean = load_wide(m + i), square = load_wide(v + i);
+    adam_number(a.rates, of.step_size, of.inv_sqrt_correction2, load_wide(g + i), param, mean, square);
     store_wide(m + i, mean);
     store_wide(v + i, square);
-    store_wide(p + i, load_wide(p + i) - mean * of.step_size / (sqrt(square) * of.inv_sqrt_correction2 + a.eps));
+    store_wide(p + i, param);
   }
-  for (; i < n; ++i) {
-    m[i] = m[i] * a.beta1 + g[i] * d1;
-    v[i] = v[i] * a.beta2 + g[i] * g[i] * d2;
-    p[i] -= m[i] * of.step_size / (__builtin_sqrtf(v[i]) * of.inv_sqrt_correction2 + a.eps);
-  }
+  for (; i < n; ++i) adam_number(a.rates, of.step_size, of.inv_sqrt_correction2, g[i], p[i], m[i], v[i]);
 }
 
 // shN of n <= kWide Gaussians from `first` on, whose gradient is not stored. `rows` has room for it, zeros where no

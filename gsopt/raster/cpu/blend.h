@@ -21,7 +21,7 @@ inline void alphas_of(
   for (int j = 0; j < n; ++j) {
     const int i = list[j];
     Whitened<px> at;
-    alphas[j] = alpha_of(exponent(Spread(local.row[i], touched.u0[i], touched.v0[i]), X, Y, at));
+    alphas[j] = alpha_of(exponent(spread(local.row[i], touched.u0[i], touched.v0[i]), X, Y, at));
   }
 }
 

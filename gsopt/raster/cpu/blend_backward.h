@@ -42,12 +42,11 @@ struct Alphas {
 };
 inline void alphas_of(const Local::Row& s, uint32_t mask, Alphas& out) {
   const Whitened<float> center = at_center(s.A, s.B, s.C, s.x, s.y);
-  const Spread spread(s, center.u, center.v);
+  const Spread<px> all = spread(s, center.u, center.v);
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     const int block = __builtin_ctz(rest);
-    out.alpha[n] =
-        alpha_of(exponent(spread, load_px(kBlockPixels.x[block]), load_px(kBlockPixels.y[block]), out.at[n]));
+    out.alpha[n] = alpha_of(exponent(all, load_px(kBlockPixels.x[block]), load_px(kBlockPixels.y[block]), out.at[n]));
   }
 }
 
@@ -58,7 +57,7 @@ template <bool Depth, bool Abs> inline void blend_splat_backward(
   const px B = splat<px>(splat_i.B), C = splat<px>(splat_i.C);
   const Vec3<px> color = splat_color(local, i);
   const px depth = splat<px>(local.depth[i]);
-  const px one = splat<px>(1.f), alpha_max = splat<px>(kAlphaMax), zero = splat<px>(0.f);
+  const px zero = splat<px>(0.f);
   const pxi here = splat_pxi(index - 1);
   Alphas alphas;
   alphas_of(splat_i, mask, alphas);
@@ -67,16 +66,16 @@ template <bool Depth, bool Abs> inline void blend_splat_backward(
   int n = 0;
   for (uint32_t rest = mask; rest; rest &= rest - 1, ++n) {
     BlockGradient& p = grads[__builtin_ctz(rest)];
-    const px alpha = keep(load_pxi(p.last) > here, alphas.alpha[n]), past = one - alpha;
-    const px T = load_px(p.T) * (one / past), weight = alpha * T, behind = load_px(p.behind);
+    const px alpha = keep(load_pxi(p.last) > here, alphas.alpha[n]);
     const Vec3<px> g = {load_px(p.r), load_px(p.g), load_px(p.b)};
     px q = dot(color, g);
     if (Depth) q = q + depth * load_px(p.depth);
-    store_px(p.T, T);
-    store_px(p.behind, behind * past + alpha * q);
+    const Passed<px> now = passed(alpha, q, load_px(p.T), load_px(p.behind));
+    store_px(p.T, now.T);
+    store_px(p.behind, now.behind);
+    const px weight = now.weight, s = now.s;
     v_color = v_color + g * weight;
     if (Depth) v_depth = v_depth + weight * load_px(p.depth);
-    const px s = keep(alpha < alpha_max, weight * (q - behind));  // a clamped alpha does not move
     const px u = alphas.at[n].u, v = alphas.at[n].v, s_u = s * u, s_v = s * v;
     s0 = s0 + s;
     su = su + s_u;

@@ -1,6 +1,6 @@
 // Which blocks of a tile each splat touches, and which splats touch a block.
 #pragma once
-#include "reach.h"
+#include "../common/reach.h"
 #include "tile.h"
 
 namespace gsopt::GSOPT_ISA {

@@ -4,12 +4,12 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "../common/adam.h"
 #include "../common/projection.h"
 #include "pool.h"
 
 namespace gsopt {
 
-constexpr int kTile = 16;    // pixels along a tile's side
 constexpr int kChunk = 256;  // splats of a tile that are worked on at once
 constexpr int kProjectChunk = 1024;
 constexpr int kLargestVector = 16;  // lanes, of any instruction set
@@ -58,8 +58,7 @@ struct Entry {
   uint32_t id, slot;
 };
 
-// One row of gradient sums per entry: moments of s in the splat's whitened coordinates, then color, depth, |gradient|.
-enum RowField { kS, kSu, kSv, kSuu, kSuv, kSvv, kWr, kWg, kWb, kWz, kAbsX, kAbsY, kRow = 16 };
+constexpr int kRow = 16;  // floats of a row of gradient sums: those of RowField, and zeros
 
 struct Parameters {
   int64_t count;
@@ -136,7 +135,7 @@ struct AdamParameter {
 
 struct AdamArguments {
   int64_t count;
-  float beta1, beta2, eps;
+  AdamRates rates;
   AdamParameter bands;  // shN without a gradient, which is found from the rest
   AdamParameter others[6];
   const float *means, *v_sh0;

@@ -7,17 +7,14 @@
 // waits for it in a ring of rows that stays in the cache. Each row of a strip has its own sum, and these are added in
 // double in one order: the same bits for any number of threads.
 #pragma once
+#include "../common/ssim.h"
 #include "frame.h"
 #include "parallel.h"
 #include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
 
-constexpr int kRadius = 5, kTaps = 2 * kRadius + 1, kStrip = 2400, kHalo = 3 * kRadius;
-constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-// exp(-k² / (2 1.5²)), normalized over k = -5..5; index = |k|.
-constexpr float kWindow[kRadius + 1] = {0.26601172f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
-
+constexpr int kStrip = 2400, kHalo = 3 * kRadius;
 // Weights of the twelve input rows y - 5 ... y + 6 in the output rows y and y + 1.
 struct PairWindow {
   float at[kTaps + 1][2];
@@ -128,17 +125,6 @@ inline wide load_first(const float* p, int n) {
 inline void store_first(float* p, wide v, int n) {
   if (n >= kWide) return store_wide(p, v);
   for (int l = 0; l < n; ++l) p[l] = v[l];
-}
-
-// (19) and (20) at one pixel-channel: SSIM and its partial derivatives with respect to E[x], E[x² + y²], E[x y].
-inline wide ssim_partials(wide mx, wide my, wide square, wide product, wide& d_mean, wide& d_square, wide& d_product) {
-  const wide mxx = mx * mx + my * my, mxy = mx * my;
-  const wide a1 = mxy * 2.f + kC1, a2 = (product - mxy) * 2.f + kC2, b1 = mxx + kC1, b2 = (square - mxx) + kC2;
-  const wide inverse = splat<wide>(1.f) / (b1 * b2), ssim = a1 * a2 * inverse;
-  d_product = a1 * inverse * 2.f;
-  d_square = splat<wide>(0.f) - ssim * b1 * inverse;
-  d_mean = (my * (a2 - a1) - mx * ssim * (b2 - b1)) * inverse * 2.f;
-  return ssim;
 }
 
 // The first n floats of a vector, zeros instead of the others.

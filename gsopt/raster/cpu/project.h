@@ -34,12 +34,6 @@ inline Splat3D<wide> load_splats(const Parameters& P, const int64_t index[kWide]
       load_wide(logits)};
 }
 
-template <class F> inline Vec3<F> view_directions(const Camera& cam, const Vec3<F>& offset, F& inverse_distance) {
-  const Vec3<F> d = offset - splat3<F>(cam.center);
-  inverse_distance = splat<F>(1.f) / sqrt(max(dot(d, d), splat<F>(1e-30f)));
-  return d * inverse_distance;
-}
-
 // The bands at the directions in which a vector of Gaussians is seen. Not inlined: all who ask must get the same bits.
 [[gnu::noinline]] inline void view_basis(const Camera& cam, const Vec3<wide>& mean, int degree, float Y[15][kWide]) {
   wide basis[15], inverse_distance;
@@ -114,15 +108,8 @@ inline void project_lanes(
   for (int l = 0; l < kWide; l += 4) __builtin_prefetch(covers + kGaussiansAhead + l, 1);
   const Projected<wide> p = project(cam, g);
 
-  const wide k = splat<wide>(kHalfLog2E);
-  const Whitening<wide> L = whitening(p);
-  const wide A = L.A * kSqrtHalfLog2E, B = L.B * kSqrtHalfLog2E, C = L.C * kSqrtHalfLog2E;
-  const wide lo = log2(max(p.opacity, splat<wide>(1e-37f)));
-  const wide reach = max(lo - kLog2AlphaMin, splat<wide>(0.f)) / k;  // (6)
-  const wide rx = sqrt(reach * p.xx), ry = sqrt(reach * p.yy);
-  const widei ok = (p.t.z > cam.near_plane) & (p.t.z < cam.far_plane) & (p.opacity >= kAlphaMin) & (p.det >= kDetMin) &
-                   (p.det < 1e37f) & (p.mx + rx > 0.f) & (p.mx - rx < static_cast<float>(cam.width)) &
-                   (p.my + ry > 0.f) & (p.my - ry < static_cast<float>(cam.height));
+  const Ellipse<wide> e = ellipse(p);
+  const widei ok = is_visible(cam, p, e);
   const int mask = movemask(ok) & ((1 << lanes) - 1);
   radii += 2 * first;
   if (!mask) {
@@ -130,20 +117,20 @@ inline void project_lanes(
     for (int l = 0; l < lanes; ++l) covers[l] = {};
     return;
   }
-  const TileBoxes boxes = tile_boxes(frame, p.mx, p.my, rx, ry, ok);
+  const TileBoxes boxes = tile_boxes(frame, p.mx, p.my, e.reach_x, e.reach_y, ok);
   const Vec3<wide> color = sh_color(frame, P, index, g.mean);
-  write_records(records, {p.mx, p.my, A, B, C, lo, color.x, color.y, color.z, p.t.z,
+  write_records(records, {p.mx, p.my, e.A, e.B, e.C, e.log2_opacity, color.x, color.y, color.z, p.t.z,
                              from_bits(boxes.x0 | boxes.x1 << 16), from_bits(boxes.y0 | boxes.y1 << 16)});
   alignas(64) int32_t box[4][kWide], tiles[2][kWide] = {}, radius[2][kWide], keys[kWide];
   store_widei(box[0], boxes.x0);
   store_widei(box[1], boxes.x1);
   store_widei(box[2], boxes.y0);
   store_widei(box[3], boxes.y1);
-  store_widei(radius[0], ceiling(rx) & ok);
-  store_widei(radius[1], ceiling(ry) & ok);
+  store_widei(radius[0], ceiling(e.reach_x) & ok);
+  store_widei(radius[1], ceiling(e.reach_y) & ok);
   store_widei(keys, bits(p.t.z));  // positive floats sort like their bits
   if (frame.skips.tiles) {
-    const TileMasks masks = tile_masks(p.mx, p.my, A, B, C, lo, boxes);
+    const TileMasks masks = tile_masks(p.mx, p.my, e.A, e.B, e.C, e.log2_opacity, boxes);
     store_widei(tiles[0], masks.low);
     store_widei(tiles[1], masks.high);
   }

@@ -69,11 +69,7 @@ inline void project_backward_lanes(const Frame& frame, const Parameters& P, cons
   const Splat3D<wide> g = load_splats(P, index);
   const Projected<wide> p = project(cam, g);
   const Whitening<wide> L = whitening(p);
-  // Blending measures u and v in units of sqrt(kHalfLog2E).
-  constexpr float length = 1.f / kSqrtHalfLog2E, square = 1.f / kHalfLog2E;
-  const wide su = field[kSu] * length, sv = field[kSv] * length;
-  const SplatGradient<wide> v = {su, sv, field[kSuu] * square, field[kSuv] * square, field[kSvv] * square, field[kS],
-      L.A * su, L.B * su + L.C * sv, field[kWz]};
+  const SplatGradient<wide> v = splat_gradient(L, field);
   Splat3D<wide> out = project_backward(cam, p, L, v);
 
   wide inv;

@@ -37,6 +37,13 @@ template <> inline f4 splat<f4>(float x) { return f4{x, x, x, x}; }
 template <> inline f8 splat<f8>(float x) { return f8{x, x, x, x, x, x, x, x}; }
 inline i8 splat8i(int32_t x) { return i8{x, x, x, x, x, x, x, x}; }
 
+inline float sqrt(float x) { return __builtin_sqrtf(x); }
+inline float abs(float x) { return __builtin_fabsf(x); }
+inline float max(float a, float b) { return a > b ? a : b; }
+inline float clamp(float x, float lo, float hi) { return x < lo ? lo : (x > hi ? hi : x); }
+inline float ceil(float x) { return __builtin_ceilf(x); }
+inline float floor(float x) { return __builtin_floorf(x); }
+
 inline i8 bits(f8 v) { return (i8)v; }
 inline f8 from_bits(i8 v) { return (f8)v; }
 inline i8 to_int(f8 v) { return __builtin_convertvector(v, i8); }  // truncates

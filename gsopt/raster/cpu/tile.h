@@ -1,6 +1,7 @@
 // What forward and backward share inside one tile: splats in tile coordinates, and its pixels in blocks of 4x2 or 4x4.
 // Coordinates are relative to the tile's center, so the numbers stay small wherever the tile lies in the image.
 #pragma once
+#include "../common/blend.h"
 #include "columns.h"
 #include "frame.h"
 #include "parallel.h"
@@ -70,33 +71,13 @@ struct alignas(64) BlockPixels {
 };
 inline constexpr BlockPixels kBlockPixels;
 
-// A splat's whitened coordinates, in units in which its exponent is log2_opacity - u² - v² (docs/math.md, 8a).
-template <class F> struct Whitened {
-  F u, v;
-};
-// Those of the tile's center, the splat's center being at (x, y) from it.
-template <class F> inline Whitened<F> at_center(F A, F B, F C, F x, F y) { return {-(A * x + B * y), -(C * y)}; }
-
-// A splat in every lane, and its exponent at the pixels of a block.
-struct Spread {
-  px A, B, C, u0, v0, log2_opacity;
-  Spread(const Local::Row& s, float u0, float v0)
-      : A(splat<px>(s.A)), B(splat<px>(s.B)), C(splat<px>(s.C)), u0(splat<px>(u0)), v0(splat<px>(v0)),
-        log2_opacity(splat<px>(s.log2_opacity)) {}
-};
-inline px exponent(const Spread& s, px X, px Y, Whitened<px>& at) {
-  at.u = s.A * X + (s.B * Y + s.u0);
-  at.v = s.C * Y + s.v0;
-  return s.log2_opacity - at.v * at.v - at.u * at.u;  // v is ready first
+// A splat in every lane.
+inline Spread<px> spread(const Local::Row& s, float u0, float v0) {
+  return {splat<px>(s.A), splat<px>(s.B), splat<px>(s.C), splat<px>(u0), splat<px>(v0), splat<px>(s.log2_opacity)};
 }
 
 inline Vec3<px> splat_color(const Local& local, int i) {
   return {splat<px>(local.row[i].r), splat<px>(local.row[i].g), splat<px>(local.b[i])};
-}
-
-// alpha of (7).
-inline px alpha_of(px exponent) {
-  return keep(exponent >= splat<px>(kLog2AlphaMin), min(exp2(exponent), splat<px>(kAlphaMax)));
 }
 
 // Calls visit(pixel of the image, lane, n) for the rows of a block, n <= 4 of whose pixels lie inside the image.

@@ -3,7 +3,9 @@
 // Over a strip of rows its right end lies in the row nearest to that of its rightmost point; its left end mirrors that.
 // Tile x holds the pixel centers 16 x + 0.5 ... 16 x + 15.5.
 #pragma once
-#include "reach.h"
+#include "../common/reach.h"
+#include "frame.h"
+#include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
 
@@ -27,21 +29,6 @@ inline TileBoxes tile_boxes(const Frame& frame, wide mx, wide my, wide rx, wide 
   return {within((mx - rx) * inv, frame.tiles_x), within((mx + rx) * inv + 1.f, frame.tiles_x),
       within((my - ry) * inv, frame.tiles_y), within((my + ry) * inv + 1.f, frame.tiles_y)};
 }
-
-// Where the ellipse ends in the kTile rows from `top` on, in x as the center has it; `mx` is the center in the image.
-template <class F> struct StripEnds {
-  F left, right, square;  // square: negative where the ellipse does not reach the rows
-
-  StripEnds(const Reach<F>& reach, F rightmost, F top, F x, F mx, float extent) {
-    const F bottom = top + (kTile - 1.f), zero = splat<F>(0.f);
-    const F y_right = clamp(rightmost, top, bottom), y_left = clamp(-rightmost, top, bottom);
-    const F square_right = reach.square(y_right), square_left = reach.square(y_left);
-    const F margin = reach.margin(mx, max(abs(y_right), abs(y_left)), extent);
-    right = x - reach.slope * y_right + sqrt(max(square_right, zero)) * reach.width + margin;
-    left = x - reach.slope * y_left - sqrt(max(square_left, zero)) * reach.width - margin;
-    square = max(square_right, square_left);
-  }
-};
 
 // Which tiles of their boxes a vector of splats touches, rows 0 to 3 and 4 to 7; arbitrary for a larger box.
 struct TileMasks {
@@ -68,19 +55,11 @@ inline TileMasks tile_masks(wide mx, wide my, wide A, wide B, wide C, wide lo, c
   return out;
 }
 
-struct Span {
-  int x0, x1;  // half open
-};
 // The tiles of row y that a splat touches. Not inlined: counting tiles and listing them must agree to the bit.
 [[gnu::noinline]] inline Span tiles_of_row(const Record& r, int y) {
-  const Reach<float> reach(r.A, r.B, r.C, r.log2_opacity);
   const float top = static_cast<float>(y * kTile) + 0.5f - r.my;
-  const StripEnds<float> ends(reach, reach.rightmost(), top, r.mx, r.mx, static_cast<float>((r.x1 + 1) * kTile));
-  if (!(ends.square >= 0.f)) return {0, 0};
-  const auto tile = [](float x) { return clamp(x * (1.f / kTile), -1.f, 65536.f); };
-  const int x0 = static_cast<int>(__builtin_ceilf(tile(ends.left - (kTile - 0.5f))));
-  const int x1 = static_cast<int>(__builtin_floorf(tile(ends.right - 0.5f))) + 1;
-  return {x0 > r.x0 ? x0 : r.x0, x1 < r.x1 ? x1 : r.x1};
+  const Span span = span_of(r.mx, top, r.A, r.B, r.C, r.log2_opacity, static_cast<float>((r.x1 + 1) * kTile));
+  return {span.x0 > r.x0 ? span.x0 : r.x0, span.x1 < r.x1 ? span.x1 : r.x1};
 }
 
 // Calls visit(tile) for every tile of splat `id`, row by row.

@@ -2,10 +2,9 @@
 // 8c).
 //
 // A pixel visited in vain costs time, a pixel missed changes the image. So the level and the ends of rows are enlarged
-// by bounds on the rounding of both sides, of the code that visits (blocks.h, tiles.h) and of `exponent` (tile.h).
+// by bounds on the rounding of both sides, of the code that visits and of `exponent` (blend.h).
 #pragma once
-#include "frame.h"
-#include "simd.h"
+#include "constants.h"
 
 namespace gsopt::GSOPT_ISA {
 
@@ -19,11 +18,6 @@ constexpr float kLevelMargin = 0x1p-15f, kLevelMarginOfC = 0x1p-13f;
 // The end of a row is a sum of lengths. It errs by 10 roundings of the sum of their sizes, u in `exponent` by 5: twice
 // that.
 constexpr float kEndMargin = 2 * 15 * kRounding;
-
-inline float sqrt(float x) { return __builtin_sqrtf(x); }
-inline float abs(float x) { return __builtin_fabsf(x); }
-inline float max(float a, float b) { return a > b ? a : b; }
-inline float clamp(float x, float lo, float hi) { return x < lo ? lo : (x > hi ? hi : x); }
 
 // F = float or a vector of splats; y is a row's distance from the splat's center.
 template <class F> struct Reach {
@@ -44,5 +38,34 @@ template <class F> struct Reach {
   // Bounds the error of an end of row y less than `extent` - kTile from the origin of x, the center.
   F margin(F x, F y, float extent) const { return (abs(x) + abs(slope) * (abs(y) + kTile) + extent) * kEndMargin; }
 };
+
+// Where the ellipse ends in the kTile rows from `top` on, in x as the center has it; `mx` is the center in the image.
+template <class F> struct StripEnds {
+  F left, right, square;  // square: negative where the ellipse does not reach the rows
+
+  StripEnds(const Reach<F>& reach, F rightmost, F top, F x, F mx, float extent) {
+    const F bottom = top + (kTile - 1.f), zero = splat<F>(0.f);
+    const F y_right = clamp(rightmost, top, bottom), y_left = clamp(-rightmost, top, bottom);
+    const F square_right = reach.square(y_right), square_left = reach.square(y_left);
+    const F margin = reach.margin(mx, max(abs(y_right), abs(y_left)), extent);
+    right = x - reach.slope * y_right + sqrt(max(square_right, zero)) * reach.width + margin;
+    left = x - reach.slope * y_left - sqrt(max(square_left, zero)) * reach.width - margin;
+    square = max(square_right, square_left);
+  }
+};
+
+// The tiles [x0, x1) of a row of tiles, `top` its first row of pixels in y as the splat's center has it, that a splat
+// touches; none where x0 >= x1.
+struct Span {
+  int x0, x1;
+};
+inline Span span_of(float mx, float top, float A, float B, float C, float log2_opacity, float extent) {
+  const Reach<float> reach(A, B, C, log2_opacity);
+  const StripEnds<float> ends(reach, reach.rightmost(), top, mx, mx, extent);
+  if (!(ends.square >= 0.f)) return {0, 0};
+  const auto tile = [](float x) { return clamp(x * (1.f / kTile), -1.f, 65536.f); };
+  return {
+      static_cast<int>(ceil(tile(ends.left - (kTile - 0.5f)))), static_cast<int>(floor(tile(ends.right - 0.5f))) + 1};
+}
 
 }  // namespace gsopt::GSOPT_ISA
