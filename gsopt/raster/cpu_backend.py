@@ -16,6 +16,7 @@ from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame, enough_memory
+from gsopt.raster.tensors import as_float32, contiguous, overwritable
 
 ISA_VARIABLE = "GSOPT_ISA"
 GRADIENTS = tuple(field.name for field in fields(Gradients))
@@ -75,7 +76,7 @@ class CpuBackend:
     ) -> RenderedFrame:
         """See `Backend.forward`."""
         height, width, n = camera.height, camera.width, len(gaussians)
-        gaussians = _as_float32(gaussians)
+        gaussians = as_float32(gaussians)
         model = _model(gaussians)
         view = self._views.of(camera, settings)
         behind = (0.0, 0.0, 0.0) if background is None else background.tolist()
@@ -104,10 +105,10 @@ class CpuBackend:
         context = frame.context
         assert isinstance(context, _Context)
         buffers = context.take()
-        gradients = _overwritable(context.gaussians, absgrad, bands, into)
+        gradients = overwritable(context.gaussians, absgrad, bands, into)
         out = _gradient(gradients)
-        alphas, depths = _contiguous(v_alphas), _contiguous(v_depths)
-        _cpu.backward(self._workspace, buffers, context.model, _contiguous(v_colors), alphas, depths, out)
+        alphas, depths = contiguous(v_alphas), contiguous(v_depths)
+        _cpu.backward(self._workspace, buffers, context.model, contiguous(v_colors), alphas, depths, out)
         self._idle.append(buffers)
         return gradients
 
@@ -198,35 +199,6 @@ class _Views(dict[tuple[Any, ...], Any]):
                 self.clear()
             self[key] = _cpu.Camera(viewmat.flatten().tolist(), K.flatten().tolist(), *size, *drawn_by)
         return self[key]
-
-
-def _overwritable(gaussians: Gaussians, absgrad: bool, bands: bool, spent: Gradients | None) -> Gradients:
-    """`spent` where its tensors fit, else uninitialized ones."""
-    if (
-        spent is not None
-        and spent.means.shape == gaussians.means.shape
-        and (spent.means2d_abs is not None) == absgrad
-        and (spent.shN is not None and spent.shN.shape == gaussians.shN.shape if bands else spent.shN is None)
-    ):
-        return spent
-    n = len(gaussians)
-    empty: dict[str, Any] = {
-        name: torch.empty_like(tensor) for name, tensor in gaussians.items() if bands or name != "shN"
-    }
-    return Gradients(
-        **{"shN": None, **empty}, means2d=torch.empty(n, 2), means2d_abs=torch.empty(n, 2) if absgrad else None
-    )
-
-
-def _as_float32(gaussians: Gaussians) -> Gaussians:
-    """The same record where that is what it holds."""
-    if all(t.dtype == torch.float32 and t.is_contiguous() and not t.requires_grad for _, t in gaussians.items()):
-        return gaussians
-    return Gaussians(**{name: tensor.detach().float().contiguous() for name, tensor in gaussians.items()})
-
-
-def _contiguous(tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.detach().float().contiguous()
 
 
 def _available_cores() -> int:

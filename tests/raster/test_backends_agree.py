@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, assume, given, settings
 from raster_scenes import Case, cases, make_case, undecided_gaussians, undecided_pixels, weights_like, with_parameter
+from simt_runtime import simt_backend
 from tolerances import (
     ADAM,
     DECISION,
@@ -39,11 +40,11 @@ drawn = settings(
 
 def built(name: str, threads: int = 2) -> Backend:
     # Not skipped where the extension is missing: a build that fails must not pass for a kernel that is right.
-    return make_backend(name, threads)
+    return simt_backend() if name == "simt" else make_backend(name, threads)
 
 
 # The reference in float32 is held to the same tolerances: they ask of no kernel what plain float32 code cannot do.
-@pytest.fixture(params=["reference", "cpu"])
+@pytest.fixture(params=["reference", "cpu", "simt"])
 def backend(request: pytest.FixtureRequest) -> Backend:
     return built(request.param)
 
@@ -105,9 +106,10 @@ def test_many_layers_over_several_tiles(backend: Backend, setting: RasterSetting
     check_gradients(*both_gradients(backend, case), floor=0)
 
 
-def test_needles() -> None:
-    # Not for the float32 reference: its determinant is a difference of large products, good enough in float64 only.
-    backend = built("cpu")
+# Not for the float32 reference: its determinant is a difference of large products, good enough in float64 only.
+@pytest.mark.parametrize("name", ["cpu", "simt"])
+def test_needles(name: str) -> None:
+    backend = built(name)
     case = make_case(6, count=24, width=48, height=32)
     shape = torch.tensor([0.0, -4.0, -4.0], dtype=torch.float64)
     case = with_parameter(case, "log_scales", shape + 0.1 * case.gaussians.log_scales)

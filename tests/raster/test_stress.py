@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 import torch
 from raster_scenes import Case
+from simt_runtime import simt_backend
 from stress_cases import STRESSES, Stress
 from stress_measure import Truth, deviation
 from stress_scenes import ahead, crowd, layers, scales, scene
@@ -35,9 +36,11 @@ STEPS = 100_000 if FULL else 300
 PERFORMANCE = Path(__file__).resolve().parents[2] / "docs" / "performance.md"
 
 
-@pytest.fixture(params=_cpu.instruction_sets())
+@pytest.fixture(params=[*_cpu.instruction_sets(), "simt"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Backend:
-    """The compiled backend on every instruction set of this processor."""
+    """The compiled backend on every instruction set of this processor, and a GPU's kernels on it."""
+    if request.param == "simt":
+        return simt_backend()
     monkeypatch.setenv("GSOPT_ISA", request.param)
     return make_backend("cpu", 2)
 

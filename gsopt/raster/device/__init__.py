@@ -1,0 +1,1 @@
+"""The GPU backend: one text of kernels, compiled where it is first used."""

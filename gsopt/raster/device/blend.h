@@ -1,0 +1,70 @@
+// Front-to-back compositing (docs/math.md, 7 and 8). One block, one tile; one thread, one pixel.
+#pragma once
+#include "frame.h"
+
+namespace gsopt::GSOPT_ISA {
+
+struct BlendArguments {
+  int width, height, tiles_x;
+  float background[3];
+  const Record* records;
+  const int *tile_begin, *ids;  // [tiles + 1] first entry of a tile; [entries] the splat of an entry
+  float *colors, *alphas, *depths, *transmittance;  // depths may be null
+  int* last;  // [pixels] number in its tile, from 1, of the last splat that a pixel took
+};
+
+struct Pixel {
+  float T, r, g, b, depth;
+  int last;
+};
+
+// The splats of a chunk, `first` being how many of the tile came before.
+inline void blend_pixel(const Row* rows, int n, int first, int t, Pixel& p) {
+  const float X = pixel_x(t), Y = pixel_y(t);
+  for (int i = 0; i < n && p.T > kTransmittanceMin; ++i) {
+    Whitened<float> at;
+    const float alpha = alpha_of(exponent(spread(rows[i]), X, Y, at)), weight = alpha * p.T;
+    if (!(alpha > 0.f)) continue;
+    p.r += rows[i].r * weight;
+    p.g += rows[i].g * weight;
+    p.b += rows[i].b * weight;
+    p.depth += rows[i].depth * weight;
+    p.T -= weight;
+    p.last = first + i + 1;
+  }
+}
+
+inline void write_pixel(const BlendArguments& a, Index at, const Pixel& p) {
+  store3(a.colors, at, {p.r + p.T * a.background[0], p.g + p.T * a.background[1], p.b + p.T * a.background[2]});
+  a.alphas[at] = 1.f - p.T;
+  if (a.depths) a.depths[at] = p.depth;
+  a.transmittance[at] = p.T;
+  a.last[at] = p.last;
+}
+
+KERNEL(blend, BlendArguments) {
+  SHARED Row rows[kThreads];
+  Own<Pixel> pixel;
+  Own<bool> done;
+  const Tile tile(a.tiles_x, a.width, a.height);
+  const int begin = a.tile_begin[block()], end = a.tile_begin[block() + 1];
+  PHASE(t) {
+    pixel[t] = {1.f, 0.f, 0.f, 0.f, 0.f, 0};
+    done[t] = !tile.has(t);
+  }
+  for (int first = begin; first < end && !all_threads(done); first += kThreads) {
+    const int n = end - first < kThreads ? end - first : kThreads;
+    PHASE(t) {
+      if (t < n) rows[t] = row_of(a.records[a.ids[first + t]], tile);
+    }
+    PHASE(t) {
+      if (!done[t]) blend_pixel(rows, n, first - begin, t, pixel[t]);
+      done[t] = done[t] || !(pixel[t].T > kTransmittanceMin);
+    }
+  }
+  PHASE(t) {
+    if (tile.has(t)) write_pixel(a, tile.pixel(t), pixel[t]);
+  }
+}
+
+}  // namespace gsopt::GSOPT_ISA
