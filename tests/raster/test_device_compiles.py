@@ -1,0 +1,68 @@
+"""NVRTC compiles the kernels for every generation of NVIDIA's GPUs: neither a GPU nor a driver is needed."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+
+from gsopt.errors import MissingDependency
+from gsopt.raster.device import compiler
+from gsopt.raster.device.compiler import CUDA, HIP, Compiler, find_compiler
+from gsopt.raster.device.layout import kernels
+from gsopt.raster.device.source import program
+
+ARCHS = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+
+
+@functools.cache
+def nvrtc() -> Compiler:
+    try:
+        return find_compiler()
+    except MissingDependency as error:  # no such library on a Mac
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("arch", ARCHS)
+def test_every_kernel_compiles(arch: str) -> None:
+    code = nvrtc().compile(program(), arch)
+    assert code.startswith(b"\x7fELF")
+    for name in kernels(program()):
+        assert f".text.{name}\0".encode() in code, name
+
+
+def test_a_processor_of_the_future_gets_what_its_driver_translates() -> None:
+    newest = nvrtc().newest("sm_999")
+    assert nvrtc().newest("sm_90") == "sm_90"
+    assert newest.startswith("compute_")
+    assert b".target sm_" in nvrtc().compile(program(), newest)
+
+
+def test_a_text_that_does_not_compile_is_told_with_its_line() -> None:
+    broken = program().replace("store3(a.colors, at,", "store4(a.colors, at,")
+    with pytest.raises(MissingDependency, match=r'blend\.h\(\d+\): error: identifier "store4" is undefined'):
+        nvrtc().compile(broken, "sm_90")
+
+
+@pytest.mark.parametrize(
+    ("dialect", "major", "line"),
+    [
+        (CUDA, "12", "pip install nvidia-cuda-nvrtc-cu12"),
+        (CUDA, "13", "pip install nvidia-cuda-nvrtc$"),
+        (HIP, None, "torch for ROCm"),
+    ],
+)
+def test_a_missing_library_is_named_with_what_installs_it(
+    dialect: compiler.Dialect, major: str | None, line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.path", [])
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    with pytest.raises(MissingDependency, match=line):
+        find_compiler(dialect, major)
+
+
+def test_only_the_version_that_torch_was_built_for_is_taken() -> None:
+    assert compiler._is_version("libnvrtc.so.13", "13")
+    assert not compiler._is_version("libnvrtc.so.12", "13")
+    assert compiler._is_version("nvrtc64_120_0.dll", "12")
+    assert not compiler._is_version("nvrtc64_130_0.dll", "12")
