@@ -34,10 +34,10 @@ from gsopt.results.finished_run import FinishedRun, open_run
 HERE = Path(__file__).resolve().parent
 RESULT = HERE / "results/interop.json"
 PAGE = HERE.parent / "docs/howto/formats.md"
-FLOORS = {".ply": 90.0, ".compressed.ply": 45.0, ".splat": 30.0, ".spz": 40.0, ".glb": 80.0}
+FLOORS = {".ply": 90.0, ".compressed.ply": 45.0, ".splat": 30.0, ".spz": 40.0, ".sog": 35.0, ".glb": 80.0}
 """dB; a wrong axis, sign or logarithm falls far below."""
-THEY_READ = {".ply", ".compressed.ply", ".splat", ".spz"}
-THEY_WRITE = {".ply", ".compressed.ply", ".spz", ".glb"}
+THEY_READ = {".ply", ".compressed.ply", ".splat", ".spz", ".sog"}
+THEY_WRITE = {".ply", ".compressed.ply", ".spz", ".sog", ".glb"}
 HALF_TURN = ["-r", "180,0,0"]
 """splat-transform leaves the axes of a .spz as they stand there: right, up, back, by the format's README."""
 BEST = 120.0
@@ -58,8 +58,8 @@ def psnr(images: Tensor, expected: Tensor) -> float:
 def convert(program: Path, source: Path, target: Path) -> None:
     """Runs splat-transform; its words are shown when it fails."""
     turn = HALF_TURN if ".spz" in (source.suffix, target.suffix) else []
-    gpu = ["-g", "cpu"] if target.suffix == ".sog" else []
-    command = [str(program), "-q", "-w", *gpu, str(source), *turn, str(target)]
+    slow = ["-g", "cpu", "-i", "1"] if target.suffix == ".sog" else []
+    command = [str(program), "-q", "-w", *slow, str(source), *turn, str(target)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode or not target.is_file():
         sys.exit(f"{' '.join(command)}\n{done.stdout}{done.stderr}")

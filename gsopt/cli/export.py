@@ -11,10 +11,10 @@ from typing import Annotated
 import tyro
 
 from gsopt.errors import InputError, UsageError
-from gsopt.formats import SUFFIXES, is_antialiased, load_splats, save_splats, suffix_of
+from gsopt.formats import READABLE, is_antialiased, load_splats, save_splats, suffix_of
 
 SPLATS_OF_RUN = "splat.ply"
-RECORDS_ANTIALIASED = (".ply", ".spz")
+RECORDS_ANTIALIASED = (".ply", ".spz", ".sog")
 """Formats that record that splats need the 2D filter of Mip-Splatting."""
 
 
@@ -25,7 +25,7 @@ class Flags:
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """A splat file or a run directory (its splat.ply)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz or .glb."""
+    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog or .glb."""
     force: bool = False
     """Replace OUT if it exists."""
     strict: bool = False
@@ -60,7 +60,7 @@ def splats_in(source: Path) -> Path:
     splats = source / SPLATS_OF_RUN
     if not splats.is_file():
         raise InputError(
-            f"{source} must be a finished run or a file ({', '.join(SUFFIXES)}), got a folder without {SPLATS_OF_RUN}. "
+            f"{source} must be a finished run or a file ({', '.join(READABLE)}), got a folder without {SPLATS_OF_RUN}. "
             "Wait until the run is done, or name one of its previews."
         )
     return splats

@@ -6,7 +6,9 @@
 | `.compressed.ply` | PlayCanvas compressed PLY | quantized in chunks of 256 |
 | `.splat` | antimatter15 | no view-dependent color, 8-bit color and rotation |
 | `.spz` | Niantic SPZ | 24-bit position, 8-bit rest |
-| `.glb` | glTF, KHR_gaussian_splatting | rounding of exp and sigmoid |
+| `.sog` | PlayCanvas SOG bundle | 16-bit position, 256 scales and colors, a palette of harmonics |
+| `.glb` | glTF, KHR_gaussian_splatting (release candidate) | rounding of exp and sigmoid |
+| `.ksplat` | mkkellogg's; is read only | |
 """
 
 from __future__ import annotations
@@ -20,23 +22,25 @@ from gsopt.errors import InputError
 if TYPE_CHECKING:
     from gsopt.gaussians import Gaussians
 
-SUFFIXES = (".ply", ".compressed.ply", ".splat", ".spz", ".glb")
+SUFFIXES = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb")
+READABLE = (*SUFFIXES, ".ksplat")
 
 
-def suffix_of(path: Path) -> str:
-    """The one of SUFFIXES that names the format of `path`, or InputError listing them."""
+def suffix_of(path: Path, known: tuple[str, ...] = SUFFIXES) -> str:
+    """The one of `known` that names the format of `path`, or InputError listing them."""
     name = path.name.lower()
-    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+    for suffix in sorted(known, key=len, reverse=True):
         if name.endswith(suffix):
             return suffix
-    raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)}, got {path.suffix!r}. Rename it or choose one.")
+    raise InputError(f"{path} must end in one of {', '.join(known)}, got {path.suffix!r}. Rename it or choose one.")
 
 
 def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write `gaussians` in the format that the suffix of `path` names; whole file or nothing.
 
     `antialiased`: the splats were optimized with the 2D filter of Mip-Splatting; recorded by formats that can (.ply,
-    .spz). Raises InputError for a row that is not finite, a rotation of length zero, a full disk or an unknown suffix.
+    .spz, .sog). Raises InputError for a row that is not finite, a rotation of length zero, a full disk or an unknown
+    suffix.
     """
     path = Path(path)
     match suffix_of(path):
@@ -56,6 +60,10 @@ def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased:
             from gsopt.formats.spz import save_spz
 
             save_spz(path, gaussians, antialiased=antialiased)
+        case ".sog":
+            from gsopt.formats.sog import save_sog
+
+            save_sog(path, gaussians, antialiased=antialiased)
         case ".glb":
             from gsopt.formats.gltf import save_glb
 
@@ -78,7 +86,7 @@ def load_splats(path: str | PathLike[str], *, strict: bool = False) -> Gaussians
 
 def _read(path: Path) -> Gaussians:
     """The splats of a file as they stand there, not yet checked."""
-    match suffix_of(path):
+    match suffix_of(path, READABLE):
         case ".splat":
             from gsopt.formats.splat import load_splat
 
@@ -87,6 +95,14 @@ def _read(path: Path) -> Gaussians:
             from gsopt.formats.spz import load_spz
 
             return load_spz(path)
+        case ".sog":
+            from gsopt.formats.sog import load_sog
+
+            return load_sog(path)
+        case ".ksplat":
+            from gsopt.formats.ksplat import load_ksplat
+
+            return load_ksplat(path)
         case ".glb":
             from gsopt.formats.gltf import load_glb
 
@@ -100,7 +116,7 @@ def _read(path: Path) -> Gaussians:
 def is_antialiased(path: str | PathLike[str]) -> bool:
     """True when a file records that its splats need the 2D filter of Mip-Splatting; some formats cannot record it."""
     path = Path(path)
-    match suffix_of(path):
+    match suffix_of(path, READABLE):
         case ".ply":
             from gsopt.formats.ply import ply_antialiased
 
@@ -109,5 +125,9 @@ def is_antialiased(path: str | PathLike[str]) -> bool:
             from gsopt.formats.spz import spz_antialiased
 
             return spz_antialiased(path)
+        case ".sog":
+            from gsopt.formats.sog import sog_antialiased
+
+            return sog_antialiased(path)
         case _:
             return False

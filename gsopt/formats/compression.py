@@ -46,6 +46,15 @@ class GzipStream:
             out += self._step(count - len(out))
         return bytes(out)
 
+    def rest(self, limit: int) -> bytes:
+        """All unpacked bytes up to the end; InputError beyond `limit`."""
+        out = bytearray()
+        while not self._zlib.eof and len(out) <= limit:
+            out += self._step(limit + 1 - len(out))
+        if len(out) > limit:
+            raise InputError(f"{self._path} holds more than {limit} bytes of extensions. Export it again.")
+        return bytes(out)
+
     def finish(self) -> None:
         """Reads to the end, where zlib compares the checksum; InputError when it differs or more data follows."""
         while not self._zlib.eof:

@@ -15,17 +15,13 @@ from numpy.typing import NDArray
 from gsopt.errors import shortened
 from gsopt.formats.files import read_exactly
 from gsopt.formats.glb_container import Document
+from gsopt.formats.glb_nodes import UNMOVED, Placement, mesh_placements
 
 EXTENSION = "KHR_gaussian_splatting"
 _UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization"}
 _COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_IDENTITY = {
-    "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
-    "translation": [0, 0, 0],
-    "rotation": [0, 0, 0, 1],
-    "scale": [1, 1, 1],
-}
+_SRGB, _LINEAR = "srgb_rec709_display", "lin_rec709_display"
 
 
 @dataclass(frozen=True)
@@ -52,25 +48,35 @@ class Accessor:
         return values
 
 
-def splat_primitives(document: Document) -> list[dict[str, Accessor]]:
-    """Semantic -> accessor of every primitive of splats; InputError when there is none or one is not supported."""
+@dataclass(frozen=True)
+class Primitive:
+    """Splats of one mesh under one node."""
+
+    attributes: dict[str, Accessor]
+    """By semantic."""
+    linear_color: bool
+    placement: Placement
+
+
+def splat_primitives(document: Document) -> list[Primitive]:
+    """Every primitive of splats, once per node that shows it; InputError when there is none or one is not supported."""
     unknown = sorted(set(document.names("extensionsRequired")) - _UNDERSTOOD)
     if unknown:
         document.fail(f"needs extensions that gsopt does not know: {', '.join(unknown)[:80]}")
     found = []
-    placements = _placements(document)
+    placements = mesh_placements(document)
     for mesh, description in enumerate(document.objects(document.root, "meshes")):
         for primitive in document.objects(description, "primitives"):
             if EXTENSION in document.object(primitive, "extensions"):
-                _check_extension(document, document.object(document.object(primitive, "extensions"), EXTENSION))
-                if mesh in placements:
-                    document.fail(f"{placements[mesh]}, which is not applied. Apply it where the file was exported")
+                linear = _linear_color(document, document.object(document.object(primitive, "extensions"), EXTENSION))
                 attributes = document.object(primitive, "attributes")
-                found.append({name: _accessor(document, attributes, name) for name in attributes if _wanted(name)})
+                accessors = {name: _accessor(document, attributes, name) for name in attributes if _wanted(name)}
+                found += [Primitive(accessors, linear, place) for place in placements.get(mesh, [UNMOVED])]
     if not found:
         document.fail(f"has no primitive with {EXTENSION}, so it holds no splats")
     # Every splat has its own 12 bytes of position: primitives that share them would multiply what a small file takes.
-    if 12 * sum(primitive["POSITION"].count for primitive in found if "POSITION" in primitive) > document.length:
+    counts = (part.attributes["POSITION"].count for part in found if "POSITION" in part.attributes)
+    if 12 * sum(counts) > document.length:
         document.fail("its primitives share their positions")
     return found
 
@@ -79,32 +85,15 @@ def _wanted(name: str) -> bool:
     return name == "POSITION" or name.startswith(f"{EXTENSION}:")
 
 
-def _check_extension(document: Document, extension: Mapping[str, Any]) -> None:
-    known = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    for key, value in known.items():
-        if extension.get(key, value) != value:
-            document.fail(f"`{key}` must be {value}, got {shortened(extension[key])}")
+def _linear_color(document: Document, extension: Mapping[str, Any]) -> bool:
+    """True for splats of linear color; InputError for what is not supported."""
+    known = {"kernel": ("ellipse",), "colorSpace": (_SRGB, _LINEAR)}
+    for key, values in known.items():
+        if extension.get(key, values[0]) not in values:
+            document.fail(f"`{key}` must be {' or '.join(values)}, got {shortened(extension[key])}")
     if document.object(extension, "extensions"):
         document.fail(f"its splats are compressed ({', '.join(extension['extensions'])[:80]})")
-
-
-def _placements(document: Document) -> dict[float, str]:
-    """The meshes that a node moves, rotates or scales, with a description of that node: their harmonics would need
-    the same rotation. Visits each node once."""
-    nodes = document.objects(document.root, "nodes")
-    placed: dict[float, str] = {}
-    visited: set[int] = set()
-    for i, node in enumerate(nodes):
-        moved = [key for key, value in _IDENTITY.items() if node.get(key, value) != value]
-        pending = [i] if moved else []
-        while pending:
-            inner = pending.pop()
-            if inner not in visited and 0 <= inner < len(nodes):
-                visited.add(inner)
-                mesh, children = nodes[inner].get("mesh"), nodes[inner].get("children")
-                placed |= {mesh: f"node {i} has a {moved[0]}"} if isinstance(mesh, int | float) else {}
-                pending += [child for child in children if isinstance(child, int)] if isinstance(children, list) else []
-    return placed
+    return extension.get("colorSpace", _SRGB) == _LINEAR
 
 
 def _accessor(document: Document, attributes: Mapping[str, Any], name: str) -> Accessor:

@@ -1,8 +1,9 @@
 """glTF 2.0 binary (.glb) with KHR_gaussian_splatting: splats as a primitive of points.
 
 Attributes POSITION, KHR_gaussian_splatting:ROTATION (unit, x y z w), :SCALE (linear), :OPACITY (0..1) and
-:SH_DEGREE_l_COEF_n; COLOR_0 colors the points where the extension is not known. Sources: Khronos, glTF 2.0, sections
-3.6 and 4.4, and extensions/2.0/Khronos/KHR_gaussian_splatting/README.md. The frame is left, up, forward.
+:SH_DEGREE_l_COEF_n; COLOR_0, linear as in all of glTF, colors the points where the extension is not known. Sources:
+Khronos, glTF 2.0, sections 3.6 and 4.4, and extensions/2.0/Khronos/KHR_gaussian_splatting/README.md, a release
+candidate. The frame is left, up, forward.
 """
 
 from __future__ import annotations
@@ -21,13 +22,16 @@ from gsopt.errors import InputError
 from gsopt.formats.axes import LEFT_UP_FORWARD, with_flipped_axes
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Document, read_container
-from gsopt.formats.glb_splats import EXTENSION, Accessor, splat_primitives
-from gsopt.formats.validation import MAX_SH_DEGREE, log_scales, logit, scales, storable, to_bytes
+from gsopt.formats.glb_splats import EXTENSION, Accessor, Primitive, splat_primitives
+from gsopt.formats.linear_color import linear_from_srgb, srgb_from_linear_color
+from gsopt.formats.placement import placed
+from gsopt.formats.validation import MAX_SH_DEGREE, log_scales, logit, scales, storable
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.quats import normalize
 
-_FLOAT, _BYTE = 5126, 5121
+_FLOAT, _SHORT = 5126, 5123
+_COMPONENT_TYPES = {torch.float32: _FLOAT, torch.uint16: _SHORT}
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAX_SIZE = (1 << 32) - 1
 _OPACITY_MARGIN = 2.0**-24
@@ -60,9 +64,10 @@ def save_glb(path: Path, gaussians: Gaussians) -> None:
 
 def _attributes(gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
     """(semantic, values [N, components]); every element is 4 bytes or a multiple, so nothing needs padding."""
-    rgba = torch.cat([sh.rgb_from_sh0(gaussians.sh0[:, 0]), gaussians.opacities[:, None]], dim=1)
+    rgb = linear_from_srgb(sh.rgb_from_sh0(gaussians.sh0[:, 0]).clamp(0, 1))
+    rgba = torch.cat([rgb, gaussians.opacities[:, None]], dim=1)
     yield "POSITION", gaussians.means
-    yield "COLOR_0", to_bytes(rgba * 255)
+    yield "COLOR_0", (rgba * 65535).round().to(torch.int32).to(torch.uint16)
     yield f"{EXTENSION}:ROTATION", normalize(gaussians.quats.double()).float()[:, [1, 2, 3, 0]]
     yield f"{EXTENSION}:SCALE", scales(gaussians.log_scales)
     yield f"{EXTENSION}:OPACITY", gaussians.opacities[:, None].clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
@@ -79,14 +84,13 @@ def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dic
     for name, tensor in attributes:
         size = tensor.numel() * tensor.element_size()
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, "target": 34962})
-        is_byte = tensor.dtype == torch.uint8
         accessor: dict[str, object] = {
             "bufferView": len(accessors),
-            "componentType": _BYTE if is_byte else _FLOAT,
+            "componentType": _COMPONENT_TYPES[tensor.dtype],
             "count": len(tensor),
             "type": _TYPES[tensor.shape[1]],
         }
-        if is_byte:
+        if tensor.dtype == torch.uint16:
             accessor["normalized"] = True
         if name == "POSITION":
             accessor |= {"min": tensor.amin(dim=0).tolist(), "max": tensor.amax(dim=0).tolist()}
@@ -113,16 +117,26 @@ def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dic
 def load_glb(path: Path) -> Gaussians:
     """Read every primitive of splats, one after the other, padded to the highest SH degree among them.
 
-    Refused with InputError: other color spaces and kernels, compression, sparse or shared accessors, files that are
-    not self-contained, and nodes that move the splats.
+    Nodes may turn, mirror, scale and move them. Splats of linear color are re-coded, which is exact for the base color
+    and approximate for the bands above. Refused with InputError: other color spaces and kernels, compression, sparse or
+    shared accessors, files that are not self-contained, and nodes that shear or scale their axes differently.
     """
     with opened(path) as (file, size):
         document = read_container(file, size, path)
-        parts = [_read(file, primitive, document) for primitive in splat_primitives(document)]
+        parts = [_read_primitive(file, primitive, document) for primitive in splat_primitives(document)]
     degree = max(part.sh_degree for part in parts)
     parts = [part.with_sh_degree(degree) for part in parts]
     joined = Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name, _ in parts[0].items()})
     return with_flipped_axes(joined, LEFT_UP_FORWARD)
+
+
+def _read_primitive(file: BinaryIO, primitive: Primitive, document: Document) -> Gaussians:
+    gaussians = _read(file, primitive.attributes, document)
+    if primitive.linear_color:
+        gaussians = srgb_from_linear_color(gaussians)
+    scale, axes, translation = primitive.placement
+    identity = scale == 1 and torch.equal(axes, torch.eye(3, dtype=axes.dtype)) and not bool(translation.any())
+    return gaussians if identity else placed(gaussians, scale, axes, translation)
 
 
 def _read(file: BinaryIO, primitive: dict[str, Accessor], document: Document) -> Gaussians:

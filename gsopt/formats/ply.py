@@ -20,7 +20,7 @@ from gsopt.errors import InputError
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply_header import Element, Header, read_header
 from gsopt.formats.ply_rows import BLOCK, float_blocks, seek_element
-from gsopt.formats.validation import BANDS, MAX_SH_DEGREE, storable
+from gsopt.formats.validation import BANDS, MAX_SH_DEGREE, log_scales, storable
 from gsopt.gaussians import PARAMETERS, Gaussians
 
 _MEANS = ("x", "y", "z")
@@ -82,8 +82,9 @@ def ply_antialiased(path: Path) -> bool:
 def read_splats(file: BinaryIO, header: Header, file_size: int, path: Path) -> Gaussians:
     """Read the element `vertex` of an Inria PLY of SH degree 0 to 3 whose header was just read from `file`.
 
-    Any order of properties, any scalar type, ascii or binary; properties that no splat needs are ignored. Raises
-    InputError for a file that is damaged, cut short or no splat.
+    Any order of properties, any scalar type, ascii or binary; properties that no splat needs are ignored. Disks of 2D
+    Gaussian splatting, which have no `scale_2`, become splats of no thickness. Raises InputError for a file that is
+    damaged, cut short or no splat.
     """
     vertex = header.element("vertex")
     if vertex is None:
@@ -91,8 +92,11 @@ def read_splats(file: BinaryIO, header: Header, file_size: int, path: Path) -> G
         raise InputError(f"{path} needs an element `vertex`, got {got}. It holds no splats: check the path.")
     bands = _bands(vertex, path)
     seek_element(file, header, vertex, file_size, path)
-    take = {name: _take(vertex, names) for name, names in _columns(bands).items()}
+    named = _columns(bands) | ({"log_scales": _SCALES[:2]} if _is_flat(vertex) else {})
+    take = {name: _take(vertex, names) for name, names in named.items()}
     out = {name: torch.empty(vertex.count, *_SHAPES.get(name, (bands, 3))) for name in take}
+    if _is_flat(vertex):
+        out["log_scales"] = log_scales(torch.zeros(vertex.count, 3))
     start = 0
     for block in float_blocks(file, header, vertex, path):
         rows = slice(start, start + len(block))
@@ -101,9 +105,16 @@ def read_splats(file: BinaryIO, header: Header, file_size: int, path: Path) -> G
             if name == "shN":
                 values = values.reshape(len(values), 3, bands).transpose(0, 2, 1)
             target = out[name][rows].numpy()
+            if name == "log_scales":
+                target = target[:, : values.shape[1]]
             target[...] = values.reshape(target.shape)
         start += len(block)
     return Gaussians(**out)
+
+
+def _is_flat(vertex: Element) -> bool:
+    """True for the disks of 2D Gaussian splatting."""
+    return _SCALES[2] not in vertex.names and set(_SCALES[:2]) <= set(vertex.names)
 
 
 def _columns(bands: int) -> dict[str, tuple[str, ...]]:
@@ -122,7 +133,7 @@ def _take(vertex: Element, names: tuple[str, ...]) -> slice | list[int]:
 
 def _bands(vertex: Element, path: Path) -> int:
     """K - 1 of the vertex element; InputError names the properties that it lacks."""
-    needed = (*_MEANS, *_SH0, "opacity", *_SCALES, *_QUATS)
+    needed = (*_MEANS, *_SH0, "opacity", *(_SCALES[:2] if _is_flat(vertex) else _SCALES), *_QUATS)
     missing = [name for name in needed if name not in vertex.names]
     if missing:
         raise InputError(

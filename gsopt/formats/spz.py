@@ -4,21 +4,27 @@ as one Zstandard stream per attribute (4).
 Layout and quantization: README and src/cc/load-spz.cc of github.com/nianticlabs/spz. Header: magic NGSP, version,
 number of splats (uint32 each), SH degree, fractional bits, flags, and one byte that is 0 (2, 3) or the number of
 streams (4). Version 4 goes on with the offset of its table (uint32) and 12 zero bytes; the table holds a compressed and
-a plain size (uint64 each) per stream. The frame is right, up, back.
+a plain size (uint64 each) per stream. The frame is right, up, back unless an extension names another.
 """
 
 from __future__ import annotations
 
 import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from gsopt.errors import InputError
+import torch
+
+from gsopt.errors import InputError, InputWarning
 from gsopt.formats.axes import RIGHT_UP_BACK, with_flipped_axes
 from gsopt.formats.compression import GzipStream, check_budget, deflated, unzstd, zstandard_compressed
 from gsopt.formats.files import opened, read_exactly, replacing
+from gsopt.formats.placement import placed
 from gsopt.formats.spz_codes import pack, stream_sizes, unpack
+from gsopt.formats.spz_extensions import RIGHT_UP_BACK as OWN_FRAME
+from gsopt.formats.spz_extensions import frame_of, ply_from_frame
 from gsopt.formats.validation import MAX_SH_DEGREE, storable
 from gsopt.gaussians import Gaussians
 
@@ -27,7 +33,10 @@ _GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
 _SIZES = struct.Struct("<QQ")
-_ANTIALIASED = 0x1
+_ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
+_MAX_EXTENSIONS = 1 << 20
+"""Bytes of all extension records; known ones have 12."""
+_MAX_FILE_DEGREE = 4
 _MAX_SPLATS = 1 << 28
 _MAX_FRACTION = 23
 
@@ -79,16 +88,22 @@ def save_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False, ver
 
 
 def load_spz(path: Path) -> Gaussians:
-    """Read a .spz of version 2, 3 or (with the package `zstandard`) 4, SH degree 0 to 3.
+    """Read a .spz of version 2, 3 or (with the package `zstandard`) 4.
 
-    Extensions are refused because they change the meaning of the values. A file that would decode to far more than its
-    own size is refused before it is unpacked.
+    Band 4 of the harmonics is left out with a warning. A file that would decode to far more than its own size is
+    refused before it is unpacked.
     """
     with opened(path) as (file, size):
         read = _read_gzip if _is_gzip(file, path) else _read_zstandard
-        header, streams = read(file, size, path)
+        header, streams, extensions = read(file, size, path)
     gaussians = unpack(streams, header.count, header.sh_degree, header.version, header.fraction_bits)
-    return with_flipped_axes(gaussians, RIGHT_UP_BACK)
+    if header.sh_degree > MAX_SH_DEGREE:
+        warnings.warn(f"{path}: band 4 of its harmonics was left out, 3 are drawn.", InputWarning, stacklevel=4)
+        gaussians = gaussians.with_sh_degree(MAX_SH_DEGREE)
+    frame = frame_of(extensions, path)
+    if frame == OWN_FRAME:
+        return with_flipped_axes(gaussians, RIGHT_UP_BACK)
+    return placed(gaussians, 1.0, ply_from_frame(frame), torch.zeros(3))
 
 
 def spz_antialiased(path: Path) -> bool:
@@ -110,26 +125,30 @@ def _is_gzip(file: BinaryIO, path: Path) -> bool:
     return start[:2] == _GZIP
 
 
-def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes]]:
+def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes], bytes]:
     stream = GzipStream(file, path)
     header = _parse(stream.take(_HEADER.size), path, (2, 3))
     check_budget(header.decoded, size, path)
     streams = [stream.take(count) for count in header.sizes]
+    extensions = stream.rest(_MAX_EXTENSIONS) if header.flags & _HAS_EXTENSIONS else b""
     stream.finish()
-    return header, streams
+    return header, streams, extensions
 
 
-def _read_zstandard(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes]]:
+def _read_zstandard(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes], bytes]:
     header = _parse(read_exactly(file, _HEADER.size, path, "its header"), path, (4,))
     (table,) = _TABLE_OFFSET.unpack(read_exactly(file, _TABLE_OFFSET.size, path, "its header"))
     check_budget(header.decoded, size, path)
     expected = [count for count in header.sizes if count]
-    if header.streams != len(expected) or table != _HEADER.size + _TABLE_OFFSET.size:
-        want = f"{len(expected)} streams and a table at byte {_HEADER.size + _TABLE_OFFSET.size}"
+    begin = _HEADER.size + _TABLE_OFFSET.size
+    if header.streams != len(expected) or not begin <= table <= begin + _MAX_EXTENSIONS:
+        want = f"{len(expected)} streams and a table at byte {begin} or soon after"
         raise InputError(f"{path} must have {want}, got {header.streams} and {table}. Export it again.")
+    records = read_exactly(file, table - begin, path, "its extensions")
     entries = [_SIZES.unpack(read_exactly(file, _SIZES.size, path, "its table")) for _ in expected]
     streams = [unzstd(file, entry, count, size, path) for entry, count in zip(entries, expected, strict=True)]
-    return header, streams + [b""] * (len(header.sizes) - len(streams))
+    extensions = records if header.flags & _HAS_EXTENSIONS else b""
+    return header, streams + [b""] * (len(header.sizes) - len(streams)), extensions
 
 
 def _parse(data: bytes, path: Path, versions: tuple[int, ...]) -> _Header:
@@ -138,10 +157,10 @@ def _parse(data: bytes, path: Path, versions: tuple[int, ...]) -> _Header:
         raise InputError(f"{path} must hold the mark `NGSP`, got {magic!r}. It is no .spz: check the path.")
     if version not in versions:
         raise InputError(f"{path}: .spz version must be 2, 3 or 4, got {version}. Export it again as version 3.")
-    if degree > MAX_SH_DEGREE:
-        raise InputError(f"{path}: SH degree must be 0 to {MAX_SH_DEGREE}, got {degree}. Export it with degree 3.")
-    if flags & ~_ANTIALIASED:
-        raise InputError(f"{path}: extensions (flags {flags:#x}) are not read. Export it without extensions.")
+    if degree > _MAX_FILE_DEGREE:
+        raise InputError(f"{path}: SH degree must be 0 to {_MAX_FILE_DEGREE}, got {degree}. Export it with degree 3.")
+    if flags & ~(_ANTIALIASED | _HAS_EXTENSIONS):
+        raise InputError(f"{path}: its flags {flags:#x} are not known. Export it as version 3.")
     if count > _MAX_SPLATS or fraction_bits > _MAX_FRACTION:
         raise InputError(
             f"{path} claims {count} splats with {fraction_bits} fraction bits. It is damaged: export again."

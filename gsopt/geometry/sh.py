@@ -75,3 +75,22 @@ def sh0_from_rgb(rgb: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
 def rgb_from_sh0(sh0: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
     """Inverse of `sh0_from_rgb` (not clamped)."""
     return sh0 * C0 + 0.5
+
+
+def turned(shN: Float[Tensor, "N K-1 3"], axes: Float[Tensor, "3 3"]) -> Float[Tensor, "N K-1 3"]:
+    """Coefficients of bands 1 and up after space was turned or mirrored: the color seen from `axes @ d` is the former
+    color from d. `axes` is orthogonal.
+
+    The functions of one band span the same space in any frame, so its matrix follows from their values at more
+    directions than coefficients.
+    """
+    degree = round(math.sqrt(shN.shape[1] + 1)) - 1
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
+    before, after = basis(directions, degree), basis(directions @ axes.double().T, degree)
+    out = [shN[:, :0]]
+    for band in range(1, degree + 1):
+        rows = slice(band * band, (band + 1) ** 2)
+        matrix = torch.linalg.lstsq(after[:, rows], before[:, rows]).solution
+        out.append(torch.einsum("ij,njc->nic", matrix.to(shN), shN[:, rows.start - 1 : rows.stop - 1]))
+    return torch.cat(out, dim=1)

@@ -14,15 +14,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splat_samples import make_splats
+from splat_samples import ksplat, make_splats
 
 from gsopt.errors import InputError, InputWarning
 from gsopt.formats import load_splats, save_splats
 from gsopt.formats.spz import save_spz
 
-NAMES = ["a.ply", "a.compressed.ply", "a.splat", "3.spz", "4.spz", "a.glb"]
+NAMES = ["a.ply", "a.compressed.ply", "a.splat", "3.spz", "4.spz", "a.sog", "a.glb", "a.ksplat"]
 STARTS = {"a.ply": b"ply\nformat binary_little_endian 1.0\n", "3.spz": b"\x1f\x8b\x08", "4.spz": b"NGSP\4\0\0\0"}
 STARTS |= {"a.glb": b"glTF\2\0\0\0", "a.compressed.ply": b"ply\nformat ascii 1.0\nelement chunk 1\n", "a.splat": b""}
+STARTS |= {"a.sog": b"PK\3\4", "a.ksplat": b"\0\1\0\0\1\0\0\0"}
 FUZZ = settings(max_examples=120, deadline=None)
 
 
@@ -37,6 +38,8 @@ def good(folder: Path) -> dict[str, bytes]:
     for name in NAMES:
         if name == "4.spz":
             save_spz(folder / name, make_splats(3, degree=1), version=4)
+        elif name == "a.ksplat":
+            (folder / name).write_bytes(ksplat(1, 3, 1))
         else:
             save_splats(folder / name, make_splats(3, degree=1))
     return {name: (folder / name).read_bytes() for name in NAMES}
@@ -74,7 +77,10 @@ def test_random_bytes(folder: Path, name: str, tail: bytes, with_start: bool) ->
 def test_cut_flipped_and_spliced(folder: Path, good: dict[str, bytes], name: str, data: st.DataObject) -> None:
     changed = bytearray(good[name])
     for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, max(0, len(changed) - 1)))
+        end = (
+            44 if name == "a.ksplat" and data.draw(st.booleans()) else len(changed)
+        )  # most of a .ksplat's header is empty
+        at = data.draw(st.integers(0, max(0, min(end, len(changed)) - 1)))
         match data.draw(st.sampled_from(["flip", "set", "cut", "insert", "remove"])):
             case "flip" if changed:
                 changed[at] ^= 1 << data.draw(st.integers(0, 7))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import sys
 from collections.abc import Callable
@@ -16,6 +17,10 @@ from splat_samples import errors, make_splats
 
 from gsopt.errors import InputError
 from gsopt.formats import gltf, load_splats, save_splats
+from gsopt.formats.linear_color import linear_from_srgb, srgb_from_linear
+from gsopt.gaussians import Gaussians
+from gsopt.geometry import sh
+from gsopt.geometry.quats import rotation_matrices
 
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, BYTE, SHORT, UBYTE, USHORT = 5126, 5120, 5122, 5121, 5123
@@ -147,8 +152,8 @@ def test_primitives_follow_one_another_at_the_highest_degree(tmp_path: Path) -> 
     assert errors(both, load_splats(tmp_path / "both.glb")).sh1 == 0
 
 
-def move(document: dict[str, Any]) -> None:
-    document["nodes"] = [{"children": [1], "translation": [0, 1, 0]}, {"mesh": 0}]
+def two_parents(document: dict[str, Any]) -> None:
+    document["nodes"] = [{"children": [2]}, {"children": [2]}, {"mesh": 0}]
 
 
 def circle(document: dict[str, Any]) -> None:
@@ -172,10 +177,16 @@ def set_in(*path: str | int, value: Any) -> Callable[[dict[str, Any]], None]:
 PRIMITIVE = ("meshes", 0, "primitives", 0)
 SPLATTING = (*PRIMITIVE, "extensions", EXTENSION)
 LIES = {
-    "a moved node": (move, "node 0 has a translation"),
-    "a circle of nodes": (circle, "node 1 has a scale"),
+    "two parents": (two_parents, "two parents"),
+    "a circle of nodes": (circle, "circle"),
+    "a child that is not there": (set_in("nodes", 0, "children", value=[7]), "numbers of nodes"),
+    "a node that shears": (set_in("nodes", 0, "matrix", value=[1, 1, *[0] * 3, 1, *[0] * 4, 1, *[0] * 4, 1]), "shears"),
+    "uneven scales": (set_in("nodes", 0, "scale", value=[1, 2, 1]), "differently"),
+    "no scale": (set_in("nodes", 0, "scale", value=[0, 0, 0]), "differently"),
+    "an infinite move": (set_in("nodes", 0, "translation", value=[1e400, 0, 0]), "finite"),
+    "no rotation": (set_in("nodes", 0, "rotation", value=[0, 0, 0, 0]), "quaternion"),
     "shared positions": (share, "share their positions"),
-    "linear color": (set_in(*SPLATTING, "colorSpace", value="lin_rec709_display"), "colorSpace"),
+    "another color": (set_in(*SPLATTING, "colorSpace", value="srgb_p3_display"), "colorSpace"),
     "another kernel": (set_in(*SPLATTING, "kernel", value="triangle"), "kernel"),
     "compressed": (set_in(*SPLATTING, "extensions", value={"X_spz": {}}), "compressed"),
     "an unknown extension": (set_in("extensionsRequired", value=["X_y"]), "X_y"),
@@ -305,3 +316,73 @@ def test_a_file_beyond_the_limit_is_refused_before_it_is_written(
     with pytest.raises(InputError, match=f"holds {size - 1} bytes, got {size}"):
         save_splats(tmp_path / "b.glb", make_splats(9))
     assert not (tmp_path / "b.glb").exists()
+
+
+def color_of(path: Path, direction: torch.Tensor) -> torch.Tensor:
+    splats = load_splats(path)
+    return sh.evaluate(splats.sh0, splats.shN, direction.expand(len(splats), 3), 3)
+
+
+def test_nodes_turn_scale_and_move_splats_and_what_is_seen_of_them(tmp_path: Path) -> None:
+    """A parent turns a quarter about y and doubles, a child moves first: all but the frame stays the same."""
+    save_splats(tmp_path / "a.glb", make_splats(30))
+    document, binary = parse(tmp_path / "a.glb")
+    half = 0.5**0.5
+    document["nodes"] = [
+        {"children": [1], "rotation": [0, half, 0, half], "scale": [2, 2, 2]},
+        {"mesh": 0, "translation": [1, 0, 0]},
+    ]
+    write(tmp_path / "b.glb", document, binary)
+    before, after = load_splats(tmp_path / "a.glb"), load_splats(tmp_path / "b.glb")
+    flip = torch.diag(torch.tensor([-1.0, -1, 1]))
+    quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    moved = before.means @ flip + torch.tensor([1.0, 0, 0])
+    torch.testing.assert_close(after.means, 2 * moved @ quarter.T @ flip, atol=1e-5, rtol=0)
+    torch.testing.assert_close(after.log_scales, before.log_scales + math.log(2), atol=1e-5, rtol=0)
+    turn = flip @ quarter @ flip
+    torch.testing.assert_close(covariances(after) / 4, turn @ covariances(before) @ turn.T, atol=1e-4, rtol=1e-4)
+    direction = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0)
+    seen = color_of(tmp_path / "b.glb", turn @ direction)
+    torch.testing.assert_close(seen, color_of(tmp_path / "a.glb", direction), atol=1e-4, rtol=0)
+
+
+def covariances(splats: Gaussians) -> torch.Tensor:
+    root = rotation_matrices(splats.quats) * splats.scales[:, None]
+    return root @ root.transpose(1, 2)
+
+
+def test_a_mesh_under_two_nodes_comes_twice(tmp_path: Path) -> None:
+    save_splats(tmp_path / "a.glb", make_splats(5))
+    document, binary = parse(tmp_path / "a.glb")
+    document["nodes"] = [{"mesh": 0}, {"mesh": 0, "translation": [0, 0, 3]}]
+    write(tmp_path / "b.glb", document, binary)
+    means = load_splats(tmp_path / "b.glb").means
+    torch.testing.assert_close((means[:5] - means[5:]).abs(), torch.tensor([[0.0, 0, 3]]).expand(5, 3))
+
+
+def test_points_have_linear_color(tmp_path: Path) -> None:
+    """A viewer that does not know the extension shows COLOR_0, which glTF reads as linear light."""
+    splats = make_splats(1, degree=0)
+    splats.sh0[0, 0] = sh.sh0_from_rgb(torch.tensor([0.5, 0.0, 1.0]))
+    save_splats(tmp_path / "a.glb", splats)
+    document, binary = parse(tmp_path / "a.glb")
+    accessor = document["accessors"][primitive(document)["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["normalized"]) == (USHORT, True)
+    offset = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    color = np.frombuffer(binary, "<u2", 4, offset) / 65535
+    assert color[:3].tolist() == pytest.approx([0.21404, 0, 1], abs=1e-4)
+
+
+def test_splats_of_linear_color_are_coded(tmp_path: Path) -> None:
+    """The base color exactly; the change with the direction to first order."""
+    splats = make_splats(40, degree=1)
+    splats.sh0[:] = sh.sh0_from_rgb(torch.rand(40, 1, 3, generator=torch.manual_seed(2)) * 0.6 + 0.2)
+    splats.shN[:] *= 0.01
+    save_splats(tmp_path / "a.glb", splats)
+    document, binary = parse(tmp_path / "a.glb")
+    set_in(*SPLATTING, "colorSpace", value="lin_rec709_display")(document)
+    write(tmp_path / "b.glb", document, binary)
+    direction = torch.tensor([0.0, 0.6, 0.8])
+    coded = srgb_from_linear(color_of(tmp_path / "a.glb", direction))
+    torch.testing.assert_close(color_of(tmp_path / "b.glb", direction), coded, atol=2e-3, rtol=0)
+    torch.testing.assert_close(linear_from_srgb(coded), color_of(tmp_path / "a.glb", direction), atol=1e-5, rtol=0)

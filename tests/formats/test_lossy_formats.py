@@ -110,14 +110,15 @@ def test_splat_of_what_splat_gave_differs_in_rotations_only(tmp_path: Path) -> N
     assert same_bits(replace(once, quats=twice.quats), twice)
 
 
-LOSSY = [".splat", ".spz", ".compressed.ply", ".glb"]
-LARGEST_HARMONIC = {".spz": 1.0, ".compressed.ply": 4.0, ".glb": 1e30}
+IN_MORTON_ORDER = (".compressed.ply", ".sog")
+LOSSY = [".splat", ".spz", ".compressed.ply", ".sog", ".glb"]
+LARGEST_HARMONIC = {".spz": 1.0, ".compressed.ply": 4.0, ".sog": 100.0, ".glb": 1e30}
 """The end of each format's range of bands 1 and up; .splat has none."""
 
 
 def rows_of(splats: Gaussians, suffix: str) -> Gaussians:
     """The splats in the order in which the format's writer stores them."""
-    return splats.select(morton_order(splats.means.double().flip(-1))) if suffix == ".compressed.ply" else splats
+    return splats.select(morton_order(splats.means.double().flip(-1))) if suffix in IN_MORTON_ORDER else splats
 
 
 @pytest.mark.parametrize("suffix", LOSSY)
@@ -170,9 +171,28 @@ def test_no_splats_come_back_as_no_splats(tmp_path: Path, suffix: str) -> None:
     assert back.sh_degree in (0, 2)
 
 
-def test_a_glb_of_no_splats_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".glb", ".sog"])
+def test_a_file_of_no_splats_is_refused_where_the_format_has_none(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(InputError, match="at least one"):
-        save_splats(tmp_path / "a.glb", make_splats(0))
+        save_splats(tmp_path / f"a{suffix}", make_splats(0))
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_sog_loses_what_it_says(tmp_path: Path, degree: int) -> None:
+    """Uniform values are the worst case of the codebooks: half of 1/256 of the extent, a little more at the ends."""
+    splats = make_splats(count=3000, degree=degree)
+    splats.shN[:] = splats.shN[:: 3000 // 100].repeat_interleave(30, dim=0)  # a palette of 375 holds 100 harmonics
+    back = round_trip(tmp_path / "a.sog", splats)
+    splats = rows_of(splats, ".sog")
+    lost = errors(splats, back)
+    bent = splats.means.abs().log1p() * splats.means.sign()
+    step = (bent.amax(0) - bent.amin(0)) / 65535
+    assert bool(((splats.means - back.means).abs() <= 0.51 * step * (1 + splats.means.abs()) + 1e-6).all())
+    assert lost.log_scales <= 10 / 256
+    assert lost.sh0 <= 3.4 / 256
+    assert lost.opacities <= BYTE
+    assert lost.quats <= 0.006
+    assert max(lost.sh1, lost.sh_rest) <= 2.4 / 256
 
 
 def test_plain_and_compressed_ply_are_told_apart_by_content(tmp_path: Path) -> None:

@@ -9,11 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.lib import recfunctions
 from plyfile import PlyData, PlyElement
 from splat_samples import make_splats, same_bits
 
 from gsopt.errors import InputError
-from gsopt.formats import is_antialiased, load_splats, save_splats
+from gsopt.formats import SUFFIXES, is_antialiased, load_splats, save_splats
 from gsopt.gaussians import Gaussians
 
 FLOATS = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -104,7 +105,7 @@ def test_integers_read_as_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("antialiased", [True, False])
-@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog"])
 def test_the_antialiasing_mark_survives(tmp_path: Path, suffix: str, antialiased: bool) -> None:
     save_splats(tmp_path / f"a{suffix}", make_splats(3), antialiased=antialiased)
     assert is_antialiased(tmp_path / f"a{suffix}") is antialiased
@@ -165,7 +166,21 @@ def test_an_unknown_suffix_lists_the_known_ones(name: str) -> None:
 
 
 def test_same_splats_same_bytes(tmp_path: Path) -> None:
-    for suffix in (".ply", ".compressed.ply", ".splat", ".spz", ".glb"):
+    for suffix in SUFFIXES:
         for name in "ab":
             save_splats(tmp_path / f"{name}{suffix}", make_splats())
         assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_disks_of_2d_splatting_become_splats_of_no_thickness(tmp_path: Path, text: bool) -> None:
+    splats = make_splats(6, degree=1)
+    save_splats(tmp_path / "a.ply", splats)
+    table = read_table(tmp_path / "a.ply")
+    flat = table[[name for name in table.dtype.names if name != "scale_2"]]
+    PlyData([PlyElement.describe(recfunctions.repack_fields(flat), "vertex")], text=text).write(tmp_path / "b.ply")
+    disks = load_splats(tmp_path / "b.ply", strict=True)
+    torch.testing.assert_close(disks.log_scales[:, :2], splats.log_scales[:, :2])
+    assert disks.scales[:, 2].max() < 1e-37
+    torch.testing.assert_close(disks.quats, splats.quats)
+    torch.testing.assert_close(disks.shN, splats.shN)

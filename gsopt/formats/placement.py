@@ -1,0 +1,42 @@
+"""Splats under a similarity: turned or mirrored, scaled alike in all axes, moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gsopt.gaussians import Gaussians
+from gsopt.geometry import sh
+from gsopt.geometry.quats import from_rotation_matrices, multiply
+
+
+def similarity_parts(linear: Float[Tensor, "3 3"]) -> tuple[float, Float[Tensor, "3 3"]] | None:
+    """(scale, orthogonal matrix) with linear = scale * orthogonal, or None where axes shear or scale differently."""
+    scale = float(linear.double().square().sum() / 3) ** 0.5
+    if not 1e-12 < scale < 1e12:
+        return None
+    axes = linear.double() / scale
+    exact = torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-4)
+    return (scale, axes) if exact else None
+
+
+def placed(
+    gaussians: Gaussians, scale: float, axes: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+) -> Gaussians:
+    """The same splats with means scale * axes @ m + translation; colors turn with them.
+
+    A mirror keeps every covariance R D² Rᵀ when R becomes -axes R, which is a rotation again.
+    """
+    proper = axes if float(torch.linalg.det(axes)) > 0 else -axes
+    turn = from_rotation_matrices(proper.double())
+    means = gaussians.means.double() @ (scale * axes.double()).T + translation.double()
+    return replace(
+        gaussians,
+        means=means.to(gaussians.means),
+        quats=multiply(turn.expand(len(gaussians), 4), gaussians.quats.double()).to(gaussians.quats),
+        log_scales=gaussians.log_scales + torch.tensor(scale).log().to(gaussians.log_scales),
+        shN=sh.turned(gaussians.shN, axes),
+    )
