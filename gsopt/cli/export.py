@@ -6,26 +6,33 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from gsopt.errors import InputError, UsageError
-from gsopt.formats import READABLE, is_antialiased, load_splats, save_splats, suffix_of
+from gsopt.formats import READABLE, SUFFIXES, is_antialiased, load_splats, save_splats, suffix_of
+
+if TYPE_CHECKING:
+    from gsopt.gaussians import Gaussians
 
 SPLATS_OF_RUN = "splat.ply"
 RECORDS_ANTIALIASED = (".ply", ".spz", ".sog")
 """Formats that record that splats need the 2D filter of Mip-Splatting."""
 
 
+PAGE = ".html"
+
+
 @dataclass(frozen=True)
 class Flags:
-    """Write splats in another format; nothing is left half-written."""
+    """Write splats in another format, or as a page that shows them in any browser; nothing is left half-written."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """A splat file or a run directory (its splat.ply)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog or .glb."""
+    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html: one
+    page with viewer, input cameras and camera path, which needs no network."""
     force: bool = False
     """Replace OUT if it exists."""
     strict: bool = False
@@ -36,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     """Convert, print the size of the file and return 0."""
     flags = tyro.cli(Flags, prog="gsopt export", args=list(argv))
     out = flags.out
-    suffix = suffix_of(out)
+    suffix = suffix_of(out, (*SUFFIXES, PAGE))
     if out.exists() and not flags.force:
         raise UsageError(f"`--out` must not exist yet, got {out}. Add --force to replace it, or choose another name.")
     if not out.parent.is_dir():
@@ -44,13 +51,31 @@ def main(argv: Sequence[str]) -> int:
     source = splats_in(flags.source)
     antialiased = is_antialiased(source)
     gaussians = load_splats(source, strict=flags.strict)
-    save_splats(out, gaussians, antialiased=antialiased)
-    if suffix == ".splat" and gaussians.sh_degree > 0:
+    if suffix == PAGE:
+        write_page(flags.source, gaussians, out, antialiased)
+    else:
+        save_splats(out, gaussians, antialiased=antialiased)
+        note_losses(suffix, gaussians.sh_degree, antialiased)
+    print(f"{out}: {len(gaussians):,} splats, {out.stat().st_size:,} bytes")
+    return 0
+
+
+def write_page(source: Path, gaussians: Gaussians, out: Path, antialiased: bool) -> None:
+    """The page of a run, with its cameras, or of a file."""
+    from gsopt.results import web
+
+    if (source / "config.json").is_file():
+        web.save_run_page(out, source)
+    else:
+        web.save_page(out, gaussians, web.scene_of_splats(gaussians, source.name, antialiased=antialiased))
+
+
+def note_losses(suffix: str, sh_degree: int, antialiased: bool) -> None:
+    """Print on stderr what the format cannot hold."""
+    if suffix == ".splat" and sh_degree > 0:
         print("gsopt: note: .splat has no view-dependent color; bands 1 and up were dropped", file=sys.stderr)
     if antialiased and suffix not in RECORDS_ANTIALIASED:
         print(f"gsopt: note: {suffix} cannot record that these splats need antialiased rendering", file=sys.stderr)
-    print(f"{out}: {len(gaussians):,} splats, {out.stat().st_size:,} bytes")
-    return 0
 
 
 def splats_in(source: Path) -> Path:

@@ -13,6 +13,7 @@ from gsopt.results.report.charts import line_chart
 from gsopt.results.report.embedded_images import animation_uri, data_uri, error_legend, error_map, shrunk
 from gsopt.results.report.read_run import EvaluatedView, Report
 from gsopt.results.report.values import number, text
+from gsopt.results.web import page as web_page
 
 VIEW_SIDE = 400
 NO_VALUE = "\N{EN DASH}"
@@ -23,16 +24,16 @@ OBJECT_TITLES = {"psnr_object": "PSNR of the object"}
 """Metrics inside masks, shown where the views have some."""
 HINTS = {"psnr": "dB, higher is better", "ssim": "higher is better", "psnr_object": "dB inside the masks"}
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4, "psnr_object": 2}
-# The page loads nothing: images are data URIs, styles are inline, and there are no scripts.
+# A page loads nothing: images are data URIs, styles are inline, and there are no scripts but the viewer's.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
-def html_document(title: str, body: str, extra_style: str = "") -> str:
+def html_document(title: str, body: str, extra_style: str = "", policy: str = POLICY) -> str:
     """A self-contained page with the report's style sheet; `body` is finished HTML."""
     style = (resources.files("gsopt.results.report") / "style.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
         f'content="light dark"><link rel="icon" href="data:,"><title>{escape(title)}</title>'
         f"<style>\n{style}{extra_style}</style></head>\n<body>{body}</body></html>\n"
@@ -43,11 +44,15 @@ def page(report: Report) -> str:
     """The whole document."""
     sections = [header(report), messages(report), views(report), inputs(report), report.cameras, report.guidance]
     sections += [progress_charts(report), settings(report)]
-    return html_document(f"{report.name} · gsopt report", f"<main>\n{''.join(sections)}</main>\n{footer(report)}")
+    body = f"<main>\n{''.join(sections)}</main>\n{footer(report)}"
+    title = f"{report.name} · gsopt report"
+    return (
+        html_document(title, body, web_page.style(), web_page.policy()) if report.viewer else html_document(title, body)
+    )
 
 
 def header(report: Report) -> str:
-    """Name, turntable and the key figures."""
+    """Name, viewer or turntable, and the key figures."""
     facts = [_count(report.input_count, "input view"), _count(report.test_count, "held-out view")]
     facts += ["" if report.steps is None else f"{report.steps:,} steps", report.config.density.strategy]
     line = " · ".join(escape(fact) for fact in facts if fact)
@@ -60,6 +65,8 @@ def header(report: Report) -> str:
 
 
 def _turntable(report: Report) -> str:
+    if report.viewer:
+        return report.viewer
     if not report.turntable:
         return '<div class="turntable empty"><p class="muted">No turntable.</p></div>'
     still, animation = data_uri(report.turntable[0]), animation_uri(report.turntable, TURNTABLE_FPS)

@@ -23,11 +23,16 @@ from gsopt.results.report.embedded_images import shrunk
 from gsopt.results.report.guidance_section import guidance_section
 from gsopt.results.report.values import number, text
 from gsopt.results.video import as_image
+from gsopt.results.web.page import viewer_element
+from gsopt.results.web.payload import packed_splats
+from gsopt.results.web.scene import scene_of_views
 
 MAX_EVALUATED_VIEWS = 12
 EXTREME_VIEWS = 4
 MAX_INPUT_VIEWS = 24
 TURNTABLE_FRAMES = 36
+MAX_VIEWER = 6 << 20
+"""Bytes of packed splats in a report, some 300,000 splats; larger runs show a turntable."""
 TURNTABLE_SIDE = 400
 
 
@@ -77,7 +82,10 @@ class Report:
     n_gaussians: int | None = None
     steps: int | None = None
     backend: str | None = None
+    viewer: str = ""
+    """Finished HTML: the splats to turn with the mouse; empty when they are too many for a report."""
     turntable: list[Image.Image] = field(default_factory=list)
+    """Replaces the viewer."""
     guidance: str = ""
     """Finished HTML."""
     cameras: str = ""
@@ -196,6 +204,19 @@ def _add_renders(report: Report, finished: FinishedRun, scene: Scene) -> None:
     for place, index in enumerate(order):
         badge = {0: "worst", len(order) - 1: "best"}.get(place, "") if len(order) > 1 else ""
         report.evaluated.append(_evaluated_view(finished, views[rows[index]["name"]], rows[index], badge))
+    report.viewer = _viewer(finished, scene)
+    if not report.viewer:
+        _add_turntable(report, finished, scene)
+
+
+def _viewer(finished: FinishedRun, scene: Scene) -> str:
+    payload = packed_splats(finished.gaussians, finished.path / "splat.ply")
+    if len(payload.data) > MAX_VIEWER:
+        return ""
+    return viewer_element(scene_of_views(finished, scene), payload, opened=False)
+
+
+def _add_turntable(report: Report, finished: FinishedRun, scene: Scene) -> None:
     size = scene.train[0].camera
     cameras = Cameras.cat([view.camera.resized(size.width, size.height) for view in scene.train])
     path_cameras = camera_path(finished, cameras, "turntable", TURNTABLE_FRAMES)

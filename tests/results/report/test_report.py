@@ -22,7 +22,7 @@ from gsopt.results.report.page import duration
 from gsopt.results.report.read_run import progress_of, representative_rows
 from gsopt.results.report.values import number
 
-VOID = {"meta", "link", "img", "br", "source", "line", "circle", "polyline"}
+VOID = {"meta", "input", "link", "img", "br", "source", "line", "circle", "polyline"}
 SIZE_LIMIT = 8 << 20
 EVIL = "<script>alert('x')</script>&\"'"
 
@@ -36,12 +36,15 @@ class Page(HTMLParser):
         self.tags: list[str] = []
         self.addresses: list[str] = []
         self.text = ""
+        self.scripts = 0
+        """Scripts that run; others are data."""
         self.feed(text)
         self.close()
         assert self.open == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
+        self.scripts += tag == "script" and not dict(attrs).get("type")
         self.addresses += [value or "" for key, value in attrs if key in ("src", "srcset", "href", "data", "action")]
         if tag not in VOID:
             self.open.append(tag)
@@ -51,7 +54,7 @@ class Page(HTMLParser):
             assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if not self.open or self.open[-1] != "style":
+        if not self.open or self.open[-1] not in ("style", "script"):
             self.text += data
 
 
@@ -83,7 +86,7 @@ def page(run: Path) -> Page:
 def test_the_page_needs_nothing_from_anywhere(run: Path, page: Page) -> None:
     assert page.addresses
     assert all(address.startswith("data:") for address in page.addresses)
-    assert "script" not in page.tags
+    assert page.scripts == 1  # the viewer
     text = (run / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|url\(|@import", text)
     assert len(text) < SIZE_LIMIT
@@ -102,7 +105,7 @@ def test_the_page_says_what_the_figures_say(run: Path, page: Page) -> None:
 
 def test_strings_from_files_stay_text(run: Path, page: Page) -> None:
     assert EVIL in page.text
-    assert "<script" not in (run / "report.html").read_text(encoding="utf-8")
+    assert EVIL not in (run / "report.html").read_text(encoding="utf-8")
 
 
 def test_hostile_names_and_values_in_metrics_stay_text_or_vanish(tmp_path: Path) -> None:
@@ -113,7 +116,7 @@ def test_hostile_names_and_values_in_metrics_stay_text_or_vanish(tmp_path: Path)
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps({**config, "versions": {EVIL: EVIL}, "gaussians_init": EVIL}))
     page = Page(write_report(run).read_text(encoding="utf-8"))
-    assert "script" not in page.tags
+    assert page.scripts == 1
     assert page.text.count(EVIL) >= 5
 
 

@@ -33,7 +33,7 @@ def test_what_sfm_said_and_drew_stands_on_the_page(tmp_path: Path) -> None:
     assert "<h2>Cameras</h2>" in page
     assert "18 of 20 photos placed (incremental)" in page
     assert 'alt="Cameras and points"' in page
-    assert "<script" not in page
+    assert EVIL not in page
 
 
 def test_corrected_poses_are_summed_up(tmp_path: Path) -> None:
@@ -51,4 +51,4 @@ def test_broken_files_are_named_and_hostile_values_vanish(tmp_path: Path) -> Non
     text = cameras_html(run)
     assert "sfm.json is not valid JSON" in text
     assert "by 0.000 degrees" in text
-    assert "<script" not in text
+    assert EVIL not in text

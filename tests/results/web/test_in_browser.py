@@ -1,0 +1,122 @@
+"""The page in headless Chromium with software rendering: the same image as the rasterizer's, and controls that work."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import Tab, tab
+from finished_runs import WIDTH, make_run, splats
+
+from gsopt.cli import main
+from gsopt.data.scene import load_scene
+from gsopt.gaussians import Gaussians
+from gsopt.results.finished_run import open_run
+from gsopt.results.web import save_run_page
+
+DRAWN = "document.querySelector('.gsopt-viewer').dataset.drawn"
+CLOSE = 35.0
+"""dB between page and rasterizer: the codes of the splats have 8 bits."""
+
+
+def many_splats() -> Gaussians:
+    """Blobs of all sizes and opacities whose colors change with the direction."""
+    few = splats(400)
+    generator = torch.Generator().manual_seed(3)
+    few.log_scales[:] = torch.rand(400, 3, generator=generator) * 4 - 5
+    few.logit_opacities[:] = torch.rand(400, generator=generator) * 10 - 5
+    return Gaussians(**{**dict(few.items()), "shN": torch.rand(400, 15, 3, generator=generator) * 0.6 - 0.3})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = make_run(tmp_path_factory.mktemp("browser"), train=3, test=1, learned=many_splats())
+    save_run_page(run / "page.html", run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with tab(tmp_path_factory.mktemp("profile") / "chromium") as opened:
+        yield opened
+
+
+def shown(browser: Tab, page: Path, mark: str, scale: int = 5) -> np.ndarray:
+    """The drawn page in a window of `scale` times the views' size."""
+    browser.open("about:blank", WIDTH * scale, 32 * scale)
+    browser.open(f"{page.as_uri()}#{mark}", WIDTH * scale, 32 * scale)
+    browser.wait_for(f"document.querySelector('.gsopt-viewer') && {DRAWN}")
+    return browser.screenshot()
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    error = float(np.square(a.astype(float) - b).mean())
+    return 99.0 if error == 0 else 10 * math.log10(255**2 / error)
+
+
+@pytest.mark.parametrize("number", [1, 2, 4])
+def test_a_page_shows_what_the_rasterizer_draws(browser: Tab, run: Path, number: int) -> None:
+    finished = open_run(run)
+    scene = load_scene(finished.config.data)
+    camera = (*scene.train, *scene.test)[number - 1].camera
+    camera = camera.resized(5 * camera.width, 5 * camera.height)
+    image = shown(browser, run / "page.html", f"view={number}&plain")
+    assert psnr(image, finished.draw(camera).numpy()) > CLOSE
+    assert browser.complaints == []
+
+
+def changed(browser: Tab, script: str) -> np.ndarray:
+    """The page after a script, when it has been drawn again."""
+    browser.value(f"delete document.querySelector('.gsopt-viewer').dataset.drawn; {script}; 0")
+    browser.wait_for(DRAWN)
+    return browser.screenshot()
+
+
+def slid(part: str, value: str) -> str:
+    element = f"document.querySelector('[data-part={part}]')"
+    return f"{element}.value = '{value}'; {element}.dispatchEvent(new Event('input'))"
+
+
+def test_controls_change_the_image(browser: Tab, run: Path) -> None:
+    before = shown(browser, run / "page.html", "view=1&plain")
+    points = changed(browser, slid("scale", "0"))
+    assert (points > 250).all(axis=2).mean() > (before > 250).all(axis=2).mean()  # more of the white background
+    plain = changed(browser, f"{slid('scale', '1')}; {slid('degree', '0')}")
+    assert 10 < psnr(plain, before) < 45
+    assert psnr(changed(browser, slid("degree", "3")), before) > 60
+    dark = changed(browser, slid("background", "#000000"))
+    assert dark.mean() < before.mean()
+    cameras = "document.querySelector('[data-part=cameras]')"
+    wired = changed(browser, f"{cameras}.checked = true; {cameras}.dispatchEvent(new Event('change'))")
+    assert psnr(wired, dark) < 60
+
+
+def test_the_mouse_turns_and_keys_step_through_the_views(browser: Tab, run: Path) -> None:
+    before = shown(browser, run / "page.html", "view=1&plain")
+    for kind, x in (("mousePressed", 50), ("mouseMoved", 90), ("mouseReleased", 90)):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=60, button="left", buttons=1, clickCount=1)
+    browser.wait_for(f"{DRAWN} && performance.now()")
+    turned = browser.screenshot()
+    assert psnr(turned, before) < 30
+    again = changed(browser, "document.querySelector('[data-part=after]').click()")
+    expected = shown(browser, run / "page.html", "view=2&plain")
+    assert psnr(again, expected) > 60
+
+
+def test_the_report_shows_the_splats(browser: Tab, run: Path) -> None:
+    from gsopt.results.report import write_report
+
+    browser.open(write_report(run).as_uri(), 1200, 800)
+    browser.wait_for(f"document.querySelector('.gsopt-viewer') && {DRAWN}")
+    assert browser.screenshot().std() > 10
+
+
+def test_a_hostile_name_stays_a_name(browser: Tab, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "<img src=x onerror=window.hacked=1>", train=2, test=0)
+    assert main(["export", str(run), "-o", str(tmp_path / "a.html")]) == 0
+    shown(browser, tmp_path / "a.html", "")
+    assert browser.value("window.hacked === undefined && document.images.length") == 0
