@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import re
 import types
 import typing
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MAX_THREADS = 1024
+DEVICE = re.compile(r"(?:(cpu|cuda)(?::\d{1,3})?)?")
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,14 @@ def _broken(hint: Any, value: Any) -> str:
     if origin is Annotated:
         return next((str(bound) for bound in args[1:] if not bound.low <= value <= bound.high), "")
     return ""
+
+
+def device(value: object) -> str:
+    """The kind of a device: "cpu", "cuda", or empty where it is left open. Raises SettingError for anything else."""
+    match = DEVICE.fullmatch(value) if isinstance(value, str) else None
+    if match is None:
+        raise SettingError(f"`device` must be cpu, cuda or a GPU as cuda:1, got {shortened(value)}. Leave it out.")
+    return match[1] or ""
 
 
 def at_least(name: str, value: float, minimum: float, remedy: str) -> None:

@@ -58,6 +58,22 @@ class Rasterizer:
     problem: str | None
 
 
+@dataclass(frozen=True)
+class Gpu:
+    """The GPU that `--backend cuda` takes, or why there is none."""
+
+    device: str | None
+    arch: str | None
+    """Its architecture, as sm_90."""
+    library: str | None
+    """The compiler of its kernels, and the driver's version."""
+    compile_seconds: float | None
+    """Time to compile the kernels, or to read them from the cache, and to load them."""
+    ms_per_step: float | None
+    """As for the rasterizer."""
+    problem: str | None
+
+
 def main(argv: Sequence[str]) -> int:
     """Print the findings; always 0, a missing part is a finding."""
     flags = tyro.cli(Flags, prog="gsopt doctor", args=argv)
@@ -77,6 +93,7 @@ def examine() -> dict[str, Any]:
         "packages": [asdict(package) for package in packages],
         "missing_extras": {extra: pip_line(extra) for extra in missing},
         "rasterizer": asdict(examine_rasterizer()),
+        "gpu": asdict(examine_gpu()),
         "lpips_vgg": find_lpips_vgg(),
     }
 
@@ -111,14 +128,28 @@ def pip_line(extra: str) -> str:
 
 
 def examine_rasterizer() -> Rasterizer:
-    """Build the fastest backend and time it."""
+    """Build the backend of this processor and time it."""
     try:
         from gsopt.raster.api import make_backend
 
-        backend = make_backend("auto")
+        backend = make_backend("cpu")
         return Rasterizer(backend.name, getattr(backend, "isa", None), measure(backend), None)
     except (GsoptError, ImportError) as error:
         return Rasterizer(None, None, None, str(error))
+
+
+def examine_gpu() -> Gpu:
+    """Compile the kernels for torch's GPU and time them."""
+    try:
+        from gsopt.raster.device.backend import DeviceBackend
+        from gsopt.raster.device.gpu import gpu_runtime
+
+        backend = DeviceBackend(gpu_runtime())
+        about = backend.runtime.about
+        seconds = float(about["compile_seconds"])
+        return Gpu(about["device"], about["arch"], about["library"], seconds, measure(backend), None)
+    except (GsoptError, ImportError) as error:
+        return Gpu(None, None, None, None, None, str(error))
 
 
 def measure(backend: Backend) -> float:
@@ -138,14 +169,14 @@ def measure(backend: Backend) -> float:
         logit_opacities=torch.randn(n, generator=random),
         sh0=torch.randn(n, 1, 3, generator=random),
         shN=0.1 * torch.randn(n, 15, 3, generator=random),
-    )
+    ).to(backend.device)
     viewmats = look_at(torch.tensor([[0.0, -4.0, 1.0]]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     camera = Cameras(viewmats, intrinsics(0.7, SIDE, SIDE)[None].float(), SIDE, SIDE)
-    v_colors = torch.rand(SIDE, SIDE, 3, generator=random)
+    v_colors = torch.rand(SIDE, SIDE, 3, generator=random).to(backend.device)
     times = []
     for _ in range(REPETITIONS):
         start = time.perf_counter()
-        backend.backward(backend.forward(gaussians, camera, RasterSettings()), v_colors)
+        backend.backward(backend.forward(gaussians, camera, RasterSettings()), v_colors).means.cpu()
         times.append(time.perf_counter() - start)
     return round(1000 * statistics.median(times), 2)
 
@@ -169,7 +200,8 @@ def text(findings: dict[str, Any]) -> str:
     for package in findings["packages"]:
         extra = f" [{package['extra']}]" if package["extra"] else ""
         lines.append(f"  {package['name'] + extra:<24} {package['version'] or 'not installed'}")
-    lines += ["", "rasterizer", *rasterizer_lines(findings["rasterizer"]), "", "LPIPS (VGG) weights"]
+    lines += ["", "rasterizer", *rasterizer_lines(findings["rasterizer"]), "", "GPU", *gpu_lines(findings["gpu"])]
+    lines += ["", "LPIPS (VGG) weights"]
     lines.append(f"  {findings['lpips_vgg']['path'] or findings['lpips_vgg']['problem']}")
     if findings["missing_extras"]:
         lines += ["", "to install what is missing"]
@@ -182,5 +214,15 @@ def rasterizer_lines(found: dict[str, Any]) -> list[str]:
         return [f"  none: {found['problem']}"]
     return [
         f"  backend {found['backend']}, instruction set {found['isa'] or 'unknown'}",
+        f"  {found['ms_per_step']} ms per forward + backward ({GAUSSIANS} Gaussians, {SIDE}x{SIDE})",
+    ]
+
+
+def gpu_lines(found: dict[str, Any]) -> list[str]:
+    if found["problem"]:
+        return [f"  none: {found['problem']}"]
+    return [
+        f"  {found['device']}, {found['arch']}",
+        f"  kernels by {found['library']}, ready in {found['compile_seconds']} s",
         f"  {found['ms_per_step']} ms per forward + backward ({GAUSSIANS} Gaussians, {SIDE}x{SIDE})",
     ]

@@ -49,7 +49,7 @@ def start(
     if threads:
         torch.set_num_threads(threads)
     folder = None if base is None else EMBEDDED if base == "embedded" else Path(base)
-    return finetune(scenes, config, out, make_backend("auto", threads), folder, report)
+    return finetune(scenes, config, out, make_backend("cpu", threads), folder, report)
 
 
 def finetune(

@@ -22,7 +22,7 @@ def morton_order(points: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
     """Indices that sort `points` along a Z curve through their bounding box; the last axis decides first, ties keep
     their order."""
     if len(points) == 0:
-        return torch.empty(0, dtype=torch.int64)
+        return torch.empty(0, dtype=torch.int64, device=points.device)
     low, high = points.amin(dim=0), points.amax(dim=0)
     cells = (points - low).double() / (high - low).double().clamp_min(1e-30) * (2**BITS - 1)
     x, y, z = (_spread(axis) for axis in cells.to(torch.int64).unbind(-1))

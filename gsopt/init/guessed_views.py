@@ -74,14 +74,15 @@ def surrounding_cameras(photo: Thumbnail, extent: float) -> Cameras:
 def drawn_voxels(grid: Grid, photo: Thumbnail, cameras: Cameras, backend: Backend) -> UInt8[Tensor, "C H W 4"]:
     """The shape in the photo's colors, which go straight through it: straight sRGB color and alpha."""
     points = grid.surface()
-    gaussians = voxel_gaussians(points, unoccluded_colors(grid, [photo], points), SPLAT_SCALE * grid.voxel)
+    colors = unoccluded_colors(grid, [photo], points)
+    gaussians = voxel_gaussians(points, colors, SPLAT_SCALE * grid.voxel).to(backend.device)
     settings, black = RasterSettings(sh_degree=0), torch.zeros(3)
     images = []
     for index in range(len(cameras)):
         frame = backend.forward(gaussians, cameras[index], settings, black)
         color = frame.colors / frame.alphas.clamp_min(1e-6)[..., None]
         images.append(torch.cat([color, frame.alphas[..., None]], dim=-1))
-    return (torch.stack(images).clamp(0, 1) * 255).round().to(torch.uint8)
+    return (torch.stack(images).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
 def voxel_gaussians(points: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], scale: float) -> Gaussians:

@@ -16,7 +16,8 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.raster.autograd import draw
 from gsopt.raster.backend import Backend, RasterSettings, enough_memory
 
-BACKENDS = ("auto", "cpu", "reference")
+BACKENDS = ("auto", "cpu", "cuda", "reference")
+DEVICES = ("cpu", "cuda")
 FLOAT32_MAX = torch.finfo(torch.float32).max
 MAX_SIDE = 1 << 24
 """Width and height of an image, px: beyond, float32 misses pixels."""
@@ -53,7 +54,7 @@ def rasterize(
     """
     _validate_types(gaussians, cameras, settings, background)
     _validate(gaussians, cameras, background)
-    engine = make_backend(backend, threads) if not hasattr(backend, "forward") else backend
+    engine = backend if hasattr(backend, "forward") else _beside(gaussians, backend, threads)
     assert not isinstance(engine, str)
     with enough_memory(len(gaussians), cameras.width, cameras.height):
         return _stacked(engine, gaussians, cameras, settings, background, depth)
@@ -79,22 +80,32 @@ def _stacked(
     )
 
 
+def _beside(gaussians: Gaussians, backend: str, threads: int) -> Backend:
+    """The backend of that name; "auto" is that of the device where the Gaussians lie."""
+    device = gaussians.means.device
+    return make_backend(backend, threads, str(device) if device.type in DEVICES else "")
+
+
 def expected_depth(depths: Float[Tensor, "*C H W"], alphas: Float[Tensor, "*C H W"]) -> Float[Tensor, "*C H W"]:
     """(Σ T alpha z) / alpha; 0 with zero gradient where alpha is 0."""
     hit = alphas > 0
     return torch.where(hit, depths / torch.where(hit, alphas, 1), 0)
 
 
-def make_backend(name: str = "auto", threads: int = 0) -> Backend:
-    """The backend of that name. "auto" is the compiled one of this machine, never the slow reference.
+def make_backend(name: str = "auto", threads: int = 0, device: str = "") -> Backend:
+    """The backend of that name. "auto" is "cuda" where torch finds a GPU, else "cpu", never the slow reference.
 
-    Raises UsageError for an unknown name, MissingDependency when the compiled extension is not built.
+    `device`: "cpu", "cuda" or a certain GPU, as "cuda:1"; it decides for "auto". Raises UsageError for an unknown name,
+    MissingDependency, with what to install, for a GPU that cannot be used and for an extension that is not built.
     """
     check.instance("backend", name, str)
     check.one_of("backend", name, BACKENDS)
     check.instance("threads", threads, int)
     check.at_least("threads", threads, 0, "0 takes one thread per core.")
     check.within("threads", threads, 0, check.MAX_THREADS, "0 takes one thread per core.")
+    device_type = check.device(device)
+    if name == "cuda" or (name == "auto" and (device_type == "cuda" or (not device_type and _sees_gpu()))):
+        return _gpu_backend(device)
     if name == "reference":
         from gsopt.raster.reference import ReferenceBackend
 
@@ -108,6 +119,19 @@ def make_backend(name: str = "auto", threads: int = 0) -> Backend:
         ) from error
     backend: Backend = module.CpuBackend(threads)
     return backend
+
+
+def _sees_gpu() -> bool:
+    from gsopt.raster.device.gpu import available
+
+    return available()
+
+
+def _gpu_backend(device: str) -> Backend:
+    from gsopt.raster.device.backend import DeviceBackend
+    from gsopt.raster.device.gpu import gpu_runtime
+
+    return DeviceBackend(gpu_runtime(device))
 
 
 def _validate_types(gaussians: object, cameras: object, settings: object, background: object) -> None:

@@ -26,6 +26,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -122,6 +123,8 @@ class Backend(Protocol):
     """A rasterizer, its photometric loss and its optimizer step: what runs once per training step."""
 
     name: str
+    device: torch.device
+    """Gaussians, gradients and images lie there; cameras and the background anywhere."""
 
     def forward(
         self,

@@ -50,6 +50,7 @@ class CpuBackend:
     """`threads` as for `workspace`."""
 
     name = "cpu"
+    device = torch.device("cpu")
 
     def __init__(self, threads: int = 0) -> None:
         self._workspace = workspace(threads)

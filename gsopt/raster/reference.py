@@ -209,6 +209,7 @@ class ReferenceBackend:
     """The oracle. `smooth_cutoff` replaces the threshold at 1/255 by a C1 ramp: only for gradient tests."""
 
     name: str = "reference"
+    device = torch.device("cpu")
 
     def __init__(self, smooth_cutoff: bool = False) -> None:
         self.smooth_cutoff = smooth_cutoff

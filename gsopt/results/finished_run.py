@@ -59,10 +59,15 @@ def open_run(run: Path, backend: str | None = None, threads: int | None = None) 
         path=run,
         config=config,
         gaussians=gaussians,
-        backend=make_backend(backend or config.backend, config.threads if threads is None else threads),
+        backend=_backend(config, backend, threads),
         settings=RasterSettings(sh_degree=gaussians.sh_degree, antialiased=config.antialiased),
         background=torch.tensor(config.data.evaluation_background),
     )
+
+
+def _backend(config: TrainConfig, backend: str | None, threads: int | None) -> Backend:
+    device = config.device if backend in (None, config.backend) else ""
+    return make_backend(backend or config.backend, config.threads if threads is None else threads, device)
 
 
 def draw(
@@ -70,7 +75,8 @@ def draw(
 ) -> UInt8[Tensor, "H W 3"]:
     """The render of one camera, clamped to 0..1 and rounded to 8 bit."""
     camera = camera.to(gaussians.means.dtype)
-    return to_bytes(backend.forward(gaussians, camera, settings, background.to(gaussians.means)).colors)
+    background = background.to(gaussians.means.dtype)
+    return to_bytes(backend.forward(gaussians.to(backend.device), camera, settings, background).colors)
 
 
 def truth(view: View, background: Float[Tensor, "3"]) -> UInt8[Tensor, "H W 3"]:

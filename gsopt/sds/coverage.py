@@ -40,10 +40,10 @@ PLAIN = RasterSettings(sh_degree=0)
 
 
 def coverage(gaussians: Gaussians, inputs: Sequence[Cameras], backend: Backend) -> Float[Tensor, "N"]:
-    """Number of input views that see each Gaussian; at most MAX_VIEWS."""
+    """Number of input views that see each Gaussian; at most MAX_VIEWS. On the CPU, as all that guidance keeps."""
     total = torch.zeros(len(gaussians))
     for camera in spread(inputs):
-        total += seen(gaussians, _small(camera), backend)
+        total += seen(gaussians, _small(camera), backend).cpu()
     return total
 
 
@@ -57,6 +57,7 @@ def seen(gaussians: Gaussians, camera: Cameras, backend: Backend) -> Float[Tenso
     frame = backend.forward(gaussians, camera, PLAIN, depth=True)
     assert frame.depths is not None
     surface = expected_depth(frame.depths, frame.alphas)
+    camera = camera.to(gaussians.means.device)
     column, row, depth = project(camera, gaussians.means)
     shown = inside(camera, column, row, depth)
     i = torch.where(shown, row, 0.0).long().clamp(0, camera.height - 1)
@@ -82,7 +83,7 @@ def uncertainty_map(
     gaussians: Gaussians, u: Float[Tensor, "N"], camera: Cameras, backend: Backend
 ) -> Float[Tensor, "H W"]:
     """sum T alpha u: the uncertainty of what a camera sees, 0 where it sees nothing."""
-    return backend.forward(_painted(gaussians, u), camera, PLAIN).colors[..., 0].clamp(0, 1)
+    return backend.forward(_painted(gaussians, u), camera, PLAIN).colors[..., 0].clamp(0, 1).cpu()
 
 
 def mean_uncertainty(
@@ -93,7 +94,7 @@ def mean_uncertainty(
     for c in range(len(cameras)):
         frame = backend.forward(painted, cameras[c], PLAIN)
         means.append(frame.colors[..., 0].sum() / frame.alphas.sum().clamp_min(1e-6))
-    return torch.stack(means).clamp(0, 1).float()
+    return torch.stack(means).clamp(0, 1).float().cpu()
 
 
 def _painted(gaussians: Gaussians, u: Float[Tensor, "N"]) -> Gaussians:

@@ -130,7 +130,8 @@ class Guidance:
             raise NumericalError(
                 f"The gradient of the guidance in step {step} is not finite. Choose --guidance.dtype float32."
             )
-        gradients = self.observer.backend.backward(frame, v_images[0].permute(1, 2, 0).contiguous())
+        backend = self.observer.backend
+        gradients = backend.backward(frame, v_images[0].permute(1, 2, 0).to(backend.device).contiguous())
         for name in GEOMETRY:
             getattr(gradients, name).mul_(self.plan.geometry)
         return gradients

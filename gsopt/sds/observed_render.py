@@ -62,14 +62,15 @@ class Observer:
         settings: RasterSettings,
         covered: Float[Tensor, "N"],
     ) -> tuple[RenderedFrame, ObservedRender]:
-        """A frame for the backward pass, and what the prior gets of it."""
+        """A frame for the backward pass, and what the prior gets of it: on the CPU, wherever it is drawn."""
         frame = self.backend.forward(gaussians, camera, settings, background, depth=self._depths)
+        alphas = frame.alphas.detach().cpu()
         return frame, ObservedRender(
             camera=camera,
-            images=frame.colors.detach().permute(2, 0, 1)[None],
-            alphas=frame.alphas.detach(),
+            images=frame.colors.detach().cpu().permute(2, 0, 1)[None],
+            alphas=alphas,
             uncertainty=self.uncertainty(gaussians, covered, camera),
-            depth=None if frame.depths is None else expected_depth(frame.depths.detach(), frame.alphas.detach()),
+            depth=None if frame.depths is None else expected_depth(frame.depths.detach().cpu(), alphas),
             references=self._nearest(gaussians, camera),
         )
 
@@ -86,4 +87,4 @@ def depth_in(gaussians: Gaussians, camera: Cameras, backend: Backend) -> Float[T
     """Expected z of the Gaussians, 0 where there is nothing."""
     frame = backend.forward(gaussians, camera, coverage.PLAIN, depth=True)
     assert frame.depths is not None
-    return expected_depth(frame.depths, frame.alphas)
+    return expected_depth(frame.depths, frame.alphas).cpu()

@@ -48,7 +48,7 @@ def save_checkpoint(folder: Path, step: int, tensors: dict[str, Tensor], meta: d
         folder.mkdir(exist_ok=True)
         with create(temporary) as file:
             mode = os.fstat(file.fileno()).st_mode
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, temporary, metadata=header)
+        save_file({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, temporary, metadata=header)
         temporary.chmod(mode)  # safetensors puts a file of its own there, which nobody else may read
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())

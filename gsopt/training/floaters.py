@@ -21,7 +21,7 @@ CHUNK = 1024
 def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:
     """True where the mean distance to the nearest neighbors exceeds its average by `sigmas` standard deviations."""
     if len(means) < MIN_GAUSSIANS:
-        return torch.zeros(len(means), dtype=torch.bool)
+        return torch.zeros(len(means), dtype=torch.bool, device=means.device)
     distances = neighbor_distances(means)
     mean = distances.mean()
     return distances > mean + sigmas * torch.maximum(distances.std(), MIN_RELATIVE_STD * mean)
@@ -35,7 +35,7 @@ def neighbor_distances(means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     nearest = max(3, round(math.sqrt(count) / stride))
     chunks = []
     for begin in range(0, count, CHUNK):
-        rows = torch.arange(begin, min(begin + CHUNK, count))
+        rows = torch.arange(begin, min(begin + CHUNK, count), device=means.device)
         distances = torch.cdist(means[rows], references, compute_mode="donot_use_mm_for_euclid_dist")
         own = rows % stride == 0
         distances[own.nonzero()[:, 0], rows[own] // stride] = math.inf

@@ -14,7 +14,7 @@ import torch
 
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, load_scene
-from gsopt.errors import InputError
+from gsopt.errors import InputError, NumericalError
 from gsopt.events import to_json, write_atomic
 from gsopt.formats.ply import save_ply
 from gsopt.gaussians import Gaussians
@@ -22,6 +22,7 @@ from gsopt.init import first_gaussians
 from gsopt.init.guessed_views import with_guessed_views
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
+from gsopt.raster.device.memory import PRIOR_BYTES, Memory
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.finite import require_finite, require_finite_loss
 from gsopt.training.guided.session import RunGuidance
@@ -76,14 +77,15 @@ def train(
     """
     began = time.process_time()
     with opened(Path(run), config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
-        with one_torch_thread():
-            backend = make_backend(config.backend, config.threads)
+        backend = make_backend(config.backend, config.threads, config.device)
+        with one_torch_thread(), on_its_gpu(backend):
             scene = load_scene(config.data)
             scene = with_recorded_mirrors(config, scene, directory)
             if guesses(config, len(scene.train)):
                 scene = with_guessed_views(scene, backend)
             plan = RunPlan.of(config, scene)
             guidance = start_guidance(config, plan, scene, backend, directory)
+            require_memory(plan, scene, backend, guidance)
             trainer, clock = _start(plan, scene, backend, directory, guidance, began)
             stopped = _advance(trainer, directory, stop, clock)
             _finish(trainer, directory, clock)
@@ -94,7 +96,7 @@ def train(
             directory.emit(kind, step=trainer.step, n=len(trainer.model), seconds=round(clock.seconds(), 3))
         return TrainResult(
             run=directory.path,
-            gaussians=trainer.model.gaussians,
+            gaussians=trainer.model.gaussians.to("cpu"),
             scene=scene,
             backend=backend.name,
             init=str(directory.recorded("gaussians_init")),
@@ -119,6 +121,45 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def on_its_gpu(backend: Backend) -> Iterator[None]:
+    """The backend's GPU is torch's current one: a prior that asks for "cuda" goes beside it."""
+    if backend.device.type != "cuda":
+        yield
+        return
+    with torch.cuda.device(backend.device):
+        yield
+
+
+def require_memory(plan: RunPlan, scene: Scene, backend: Backend, guidance: RunGuidance | None) -> None:
+    """Raise NumericalError before the first step where the GPU's memory will not do."""
+    if backend.device.type != "cuda":
+        return
+    views = scene.drawn
+    pixels = max(view.camera.width * view.camera.height for view in views)
+    every = sum(16 * view.camera.width * view.camera.height for view in views)
+    targets = min(int(plan.target_cache_mb * 1e6), every)
+    free, _ = torch.cuda.mem_get_info(backend.device)
+    prior = PRIOR_BYTES if guidance is not None else 0
+    memory = Memory.of(plan.density.max_gaussians, plan.schedule.max_sh_degree, pixels, targets, prior)
+    memory.require(backend.device, free)
+
+
+@contextmanager
+def gpu_memory(step: int, last_good: Path | None) -> Iterator[None]:
+    """NumericalError, with the way on, where a GPU's memory ends in the middle of a run."""
+    try:
+        yield
+    except (torch.OutOfMemoryError, NumericalError) as error:
+        if isinstance(error, NumericalError) and not isinstance(error.__cause__, torch.OutOfMemoryError):
+            raise
+        state = f"The last good state is {last_good}." if last_good else "No checkpoint was written yet."
+        raise NumericalError(
+            f"The GPU's memory ended in step {step + 1}: {error} {state} Go on with the CPU (--resume --backend cpu), "
+            "or start in another folder with a lower --max-gaussians."
+        ) from error
 
 
 class Clock:
@@ -176,6 +217,7 @@ def _start(
         step=trainer.step,
         pid=os.getpid(),
         backend=backend.name,
+        device=str(backend.device),
         init=directory.recorded("gaussians_init"),
         n=len(trainer.model),
         train_views=len(names),
@@ -216,7 +258,8 @@ def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock
     while not trainer.finished:
         if stop:
             return True
-        loss, view = trainer.advance()
+        with gpu_memory(trainer.step, _last_good(directory)):
+            loss, view = trainer.advance()
         require_finite_loss(loss, view, trainer.step, _last_good(directory))
         if trainer.step % FINITE_EVERY == 0:
             _check_finite(trainer, directory)
@@ -240,7 +283,7 @@ def is_due(step: int, every: int) -> bool:
 def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
     _save(trainer, directory, clock)
-    save_ply(directory.path / "splat.ply", trainer.model.gaussians, antialiased=trainer.plan.antialiased)
+    save_ply(directory.path / "splat.ply", trainer.model.gaussians.to("cpu"), antialiased=trainer.plan.antialiased)
     if trainer.poses is not None:
         write_atomic(directory.path / "poses.json", to_json(trainer.poses.record(trainer.scene.origin)))
 
@@ -256,7 +299,7 @@ def _preview(trainer: Trainer, directory: RunDirectory) -> None:
     """The splats so far: written, closed, then announced."""
     _check_finite(trainer, directory)
     path = _preview_path(trainer, directory)
-    save_ply(path, trainer.model.gaussians, antialiased=trainer.plan.antialiased)
+    save_ply(path, trainer.model.gaussians.to("cpu"), antialiased=trainer.plan.antialiased)
     directory.emit("preview", step=trainer.step, path=path.relative_to(directory.path).as_posix())
 
 

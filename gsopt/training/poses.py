@@ -59,7 +59,7 @@ class PoseRefinement:
         if not bool(rows.any()):
             return
         if self._steps[index] == 0:
-            self._whitening[index] = whitening(self.viewmats[index], gaussians.means[rows].double())
+            self._whitening[index] = whitening(self.viewmats[index], gaussians.means[rows].cpu().double())
         self._steps[index] += 1
         seen, W = int(self._steps[index]), self._whitening[index]
         v_u = W @ pose_gradient(self.viewmats[index], gaussians, gradients, sh_degree)  # W is symmetric
@@ -111,15 +111,16 @@ def pose_gradient(
 ) -> Float[Tensor, "6"]:
     """dL/d(omega, tau) at 0 of the picture that exp(xi) · viewmat sees (docs/math.md, eq. 23); float64."""
     rows = seen_rows(gradients)
+    device = gaussians.means.device
     means, rotations = gaussians.means[rows].double(), gaussians.quats[rows].double()
     v_means, v_quats = gradients.means[rows].double(), gradients.quats[rows].double()
-    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    R, t = viewmat[:3, :3].to(device), viewmat[:3, 3].to(device)
     v_tau = R @ v_means.sum(0)
     v_geometry = v_means - _through_color(gaussians, gradients, rows, -R.T @ t, sh_degree)
     arms = torch.linalg.cross(means @ R.T + t, v_geometry @ R.T).sum(0)
-    axes = torch.eye(3, 4, dtype=torch.float64).roll(1, 1)[:, None]  # the quaternions i, j, k
+    axes = torch.eye(3, 4, dtype=torch.float64, device=device).roll(1, 1)[:, None]  # the quaternions i, j, k
     turned = (quats.multiply(axes, rotations[None]) / 2 * v_quats).sum((1, 2))  # omega in the world's axes
-    return torch.cat([arms + R @ turned, v_tau])
+    return torch.cat([arms + R @ turned, v_tau]).cpu()
 
 
 def seen_rows(gradients: Gradients) -> Bool[Tensor, "N"]:

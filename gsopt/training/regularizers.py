@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.gaussians import Gaussians
+from gsopt.training.randomness import uniform
 
 # What a left-out Gaussian's logit becomes: an opacity of 4e-44, which every backend culls.
 ABSENT = -100.0
@@ -48,7 +49,7 @@ class Dropout:
         """Leave each Gaussian out with probability `rate`."""
         opacities = gaussians.opacities
         raised = (opacities / (1 - rate)).clamp_(1e-30, OPAQUE)
-        missing = torch.rand(len(gaussians), generator=generator) < rate
+        missing = uniform(len(gaussians), generator=generator, device=opacities.device) < rate
         slope = (1 - opacities).div_(1 - raised).masked_fill_(missing.logical_or(raised == OPAQUE), 0.0)
         logits = torch.logit(raised).masked_fill_(missing, ABSENT)
         return Dropout(replace(gaussians, logit_opacities=logits), slope)

@@ -20,8 +20,9 @@ Listener = Callable[[Mapping[str, Any]], None]
 
 # What a run leaves behind that must not be lost. A folder with config.json, events and a log alone holds no work.
 WORK = ("splat.ply", "metrics.json", "report.html", "previews/*", "checkpoints/*.safetensors")
-# Settings that may differ when a run is resumed: they do not change a bit of the result.
-FREE = ("threads", "checkpoint_every", "preview_every", "data.cache_mb")
+# Settings that may differ when a run is resumed: they do not change a bit of the result, but for backend and device, of
+# which each has bits of its own: a run must not be lost with its GPU.
+FREE = ("threads", "checkpoint_every", "preview_every", "data.cache_mb", "backend", "device")
 # Names of files before they are whole: a dot, the name, the process; and what safetensors takes.
 TEMPORARY = re.compile(r"\..+\.\d+\.tmp|\.tmp\w{6}")
 PACKAGES = ("torch", "numpy", "pillow", "safetensors")

@@ -68,7 +68,7 @@ class Bands:
         """Take one step's gradient with respect to the colors."""
         g = gradients.sh0[:, 0] / sh.C0
         seen = (g != 0).any(dim=1).float()
-        directions = torch.nn.functional.normalize(gaussians.means - camera.centers, dim=1)
+        directions = torch.nn.functional.normalize(gaussians.means - camera.centers.to(gaussians.means), dim=1)
         Y = sh.basis(directions, self.degree + 1)[:, (self.degree + 1) ** 2 :] * seen[:, None]
         new = {"n": seen, "g": g, "gg": g * g, "Y": Y, "YY": Y * Y, "Yg": Y[..., None] * g[:, None]}
         kept = self._sums if len(self._sums.get("n", ())) == len(gaussians) else {}
@@ -103,10 +103,10 @@ class Bands:
     def tensors(self) -> dict[str, Tensor]:
         return {"degree": torch.tensor(self.degree), **self._sums}
 
-    def restore(self, tensors: dict[str, Tensor], count: int) -> None:
+    def restore(self, tensors: dict[str, Tensor], count: int, device: torch.device) -> None:
         """Take the sums over `count` Gaussians back."""
         self.degree = int(tensors["degree"])
-        self._sums = {name: tensor for name, tensor in tensors.items() if name != "degree"}
+        self._sums = {name: tensor.to(device) for name, tensor in tensors.items() if name != "degree"}
         self._require_shapes(count)
 
     def _require_shapes(self, count: int) -> None:

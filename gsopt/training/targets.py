@@ -14,6 +14,8 @@ from gsopt.data.scene import View
 from gsopt.geometry.cameras import Cameras
 from gsopt.training.content_window import content_window
 
+CPU = torch.device("cpu")
+
 
 @dataclass(frozen=True)
 class Target:
@@ -54,9 +56,12 @@ class Targets:
     background is added at every step.
     """
 
-    def __init__(self, views: Sequence[View], fixed: Float[Tensor, "3"] | None, budget: int) -> None:
+    def __init__(
+        self, views: Sequence[View], fixed: Float[Tensor, "3"] | None, budget: int, device: torch.device = CPU
+    ) -> None:
         self._views = views
         self._fixed = fixed
+        self._device = device
         self._budget = budget
         self._factor = 1
         self._kept: dict[tuple[int, bool], Target] = {}
@@ -71,7 +76,7 @@ class Targets:
         target = self._kept.get((index, whole)) or self._make(index, whole)
         if self._fixed is not None or target.alphas is None:
             return target
-        colors = torch.addcmul(target.colors, 1 - target.alphas[..., None], background)
+        colors = torch.addcmul(target.colors, 1 - target.alphas[..., None], background.to(self._device))
         return replace(target, colors=colors)
 
     def _make(self, index: int, whole: bool) -> Target:
@@ -85,11 +90,18 @@ class Targets:
         )
         if not whole:
             target = cropped(target)
+        target = moved(target, self._device)
         size = target.colors.nbytes + (0 if target.alphas is None else target.alphas.nbytes)
         if self._bytes + size <= self._budget:
             self._kept[index, whole] = target
             self._bytes += size
         return target
+
+
+def moved(target: Target, device: torch.device) -> Target:
+    """The same with its images on `device`; the camera stays."""
+    alphas = None if target.alphas is None else target.alphas.to(device)
+    return replace(target, colors=target.colors.to(device), alphas=alphas)
 
 
 def cropped(target: Target) -> Target:

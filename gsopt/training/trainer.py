@@ -59,9 +59,12 @@ class Trainer:
         self._flatness = Flatness.of(views + plan.extra_per_epoch)
         self._resting = Resting(views + images)
         self._bands = Bands(plan.schedule.optimizer.sh_degree_every, plan.schedule.max_sh_degree)
-        self._targets = Targets(scene.drawn, plan.background.constant(), int(plan.target_cache_mb * 1e6))
-        self.model = OptimizedGaussians.start(self._first(gaussians))
-        self._density = make_density(plan.density, plan.schedule, len(self.model), self._generators["density"])
+        cache = int(plan.target_cache_mb * 1e6)
+        self._targets = Targets(scene.drawn, plan.background.constant(), cache, backend.device)
+        self.model = OptimizedGaussians.start(self._first(gaussians).to(backend.device))
+        self._density = make_density(
+            plan.density, plan.schedule, len(self.model), self._generators["density"], backend.device
+        )
 
     def _first(self, gaussians: Gaussians) -> Gaussians:
         """The first Gaussians within the budget, in Morton order, as float32 with the run's bands."""
@@ -245,14 +248,14 @@ class Trainer:
         self._last = _whole("last", meta["last"], self._schedule.iterations)
         for name in PARAMETERS:
             _whole(f"adam_steps.{name}", meta["adam_steps"][name], self.step)
-        gaussians, exp_avg, exp_avg_sq = (_record(tensors, kind) for kind in RECORDS)
+        gaussians, exp_avg, exp_avg_sq = (_record(tensors, kind).to(self.backend.device) for kind in RECORDS)
         gaussians.validate()
         self.model = OptimizedGaussians(
             gaussians, exp_avg, exp_avg_sq, {name: int(meta["adam_steps"][name]) for name in PARAMETERS}
         )
         self._density.restore(_part(tensors, "density."))
         self._resting.restore(_part(tensors, "resting."))
-        self._bands.restore(_part(tensors, "bands."), len(gaussians))
+        self._bands.restore(_part(tensors, "bands."), len(gaussians), self.backend.device)
         if self._guidance is not None:
             self._guidance.restore(_part(tensors, "guidance."), meta["guidance"])
         if self.poses is not None:

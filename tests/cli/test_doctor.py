@@ -6,6 +6,7 @@ import json
 from importlib import metadata
 
 import pytest
+from simt_runtime import SimtRuntime
 
 from gsopt import cli
 from gsopt.cli import doctor
@@ -83,3 +84,25 @@ def test_weights_that_a_variable_names_wrongly_are_a_finding(monkeypatch, capsys
     found = findings(capsys)["lpips_vgg"]
     assert found["path"] is None
     assert "/no/such/file.npz" in found["problem"]
+
+
+def test_a_gpu_that_cannot_be_used_is_a_finding_with_its_pip_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("torch.version.cuda", None)
+    assert "pip install torch" in findings(capsys)["gpu"]["problem"]
+    assert cli.main(["doctor"]) == 0
+    assert "none: `backend` is cuda, but this torch" in capsys.readouterr().out
+
+
+def test_a_gpu_is_named_and_timed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    runtime = SimtRuntime()
+    runtime.about = {"device": "Pretended", "arch": "sm_90", "library": "libnvrtc 13.0", "compile_seconds": "2.50"}
+    monkeypatch.setattr("gsopt.raster.device.gpu.gpu_runtime", lambda: runtime)
+    monkeypatch.setattr(doctor, "GAUSSIANS", 200)
+    found = findings(capsys)["gpu"]
+    assert (found["device"], found["arch"], found["library"]) == ("Pretended", "sm_90", "libnvrtc 13.0")
+    assert found["compile_seconds"] == 2.5
+    assert found["ms_per_step"] > 0
+    assert cli.main(["doctor"]) == 0
+    assert "Pretended, sm_90" in capsys.readouterr().out

@@ -138,7 +138,7 @@ def test_a_band_is_drawn_where_the_residual_follows_it_and_not_where_it_is_noise
 
 def test_a_resumed_decision_about_bands_is_the_one_of_the_run_that_never_stopped() -> None:
     bands, resumed = residuals(8, dependent=True), Bands(every=8, highest=3)
-    resumed.restore(bands.tensors(), 400)
+    resumed.restore(bands.tensors(), 400, torch.device("cpu"))
     assert resumed.ratio() == bands.ratio() > Bands.LEAST_RATIO
     for one in (bands, resumed):
         one.decide(8)

@@ -49,7 +49,9 @@ def _shape_of(finished: FinishedRun, scene: Scene, view: View) -> tuple[float | 
     if pixels.shape[2] < 4 and depth is None:
         return None, None
     camera = view.camera.to(finished.gaussians.means.dtype)
-    frame = finished.backend.forward(finished.gaussians, camera, finished.settings, None, depth=True)
+    frame = finished.backend.forward(
+        finished.gaussians.to(finished.backend.device), camera, finished.settings, None, depth=True
+    )
     solid = frame.alphas > MASK_ALPHA
     iou = overlap(solid, pixels[..., 3] > 255 * MASK_ALPHA) if pixels.shape[2] == 4 else None
     if depth is None or frame.depths is None:

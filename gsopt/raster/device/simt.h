@@ -1,6 +1,6 @@
 // How the kernels in this folder are written, for NVRTC and HIPRTC. A kernel is a sequence of phases; in a phase every
 // thread of a block does its own work, and none begins the next before all are done: a barrier cannot be forgotten.
-// No kernel knows how many threads of a processor march together. tests/raster/simt.h runs the same text on a CPU.
+// No kernel knows how many threads of a processor march together. tests/simt.h runs the same text on a CPU.
 #pragma once
 
 #define GSOPT_ISA device

@@ -44,15 +44,17 @@ class DensityControl(Protocol):
         ...
 
 
-def make_density(plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator) -> DensityControl:
-    """The run's strategy for `count` first Gaussians."""
+def make_density(
+    plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator, device: torch.device
+) -> DensityControl:
+    """The run's strategy for `count` first Gaussians on `device`."""
     if plan.strategy == "mcmc":
         from gsopt.training.density.mcmc import Mcmc
 
         return Mcmc(plan, schedule, generator)
     from gsopt.training.density.adc import Adc
 
-    return Adc(plan, schedule, count, generator)
+    return Adc(plan, schedule, count, generator, device)
 
 
 def at_least_one(keep: Bool[Tensor, "N"], scores: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:

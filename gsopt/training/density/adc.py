@@ -15,25 +15,30 @@ from gsopt.raster.backend import Gradients
 from gsopt.training.density import at_least_one
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
+from gsopt.training.randomness import normal
 from gsopt.training.schedule import Schedule
 
 # A split Gaussian becomes two whose scales are divided by this (Kerbl et al. 2023, section 5.2).
 SPLIT_SHRINK = 1.6
+CPU = torch.device("cpu")
 
 
 class Adc:
     """Grows where the image pulls hard on a projected center, prunes what is transparent or too large."""
 
-    def __init__(self, plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator, device: torch.device = CPU
+    ) -> None:
         self._plan = plan
         self._schedule = schedule
         self._generator = generator
+        self._device = device
         self._forget(count)
 
     def _forget(self, count: int) -> None:
-        self.grad_sum = torch.zeros(count)
+        self.grad_sum = torch.zeros(count, device=self._device)
         """Sum over views of |dLoss/dmean2d| in normalized device coordinates."""
-        self.seen = torch.zeros(count, dtype=torch.int32)
+        self.seen = torch.zeros(count, dtype=torch.int32, device=self._device)
         """Number of views in which the Gaussian was drawn."""
 
     def after_backward(
@@ -65,7 +70,7 @@ class Adc:
         return {"grad_sum": self.grad_sum, "seen": self.seen}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        self.grad_sum, self.seen = tensors["grad_sum"], tensors["seen"]
+        self.grad_sum, self.seen = (tensors[name].to(self._device) for name in ("grad_sum", "seen"))
 
     def _grow_and_prune(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
         """Clone small Gaussians and split large ones where the mean gradient is above the threshold; prune both."""
@@ -106,7 +111,7 @@ def largest_scales(gaussians: Gaussians) -> Float[Tensor, "N"]:
 def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
     """Two smaller Gaussians for each one, their centers drawn from it."""
     twice = gaussians.append(gaussians)
-    local = torch.randn(len(twice), 3, generator=generator) * twice.scales
+    local = normal(len(twice), 3, generator=generator, device=twice.means.device) * twice.scales
     offsets = (quaternions.rotation_matrices(twice.quats) @ local[..., None])[..., 0]
     return replace(twice, means=twice.means + offsets, log_scales=twice.log_scales - math.log(SPLIT_SHRINK))
 

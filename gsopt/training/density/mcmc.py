@@ -11,6 +11,7 @@ from torch import Tensor
 from gsopt.raster.backend import Gradients
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
+from gsopt.training.randomness import normal
 from gsopt.training.schedule import Schedule
 
 # Noise is scaled by sigmoid(-STEEPNESS (o - HALF)): only nearly transparent Gaussians wander (the authors' constants).
@@ -47,7 +48,7 @@ class Mcmc:
             return
         opacities = torch.sigmoid(gaussians.logit_opacities.index_select(0, rows))
         mobility = torch.sigmoid((HALF - opacities) * STEEPNESS)
-        xi = torch.randn(3, len(rows), generator=self._generator)
+        xi = normal(3, len(rows), generator=self._generator, device=rows.device)
         xi *= mobility * (self._plan.noise_lr * lr_means)
         moves = spread(gaussians.quats.index_select(0, rows), gaussians.log_scales.index_select(0, rows), xi)
         gaussians.means.index_copy_(0, rows, moves.add_(gaussians.means.index_select(0, rows)))
@@ -144,6 +145,6 @@ def _cross(a: Columns, b: Columns) -> Columns:
 
 def draw(weights: Float[Tensor, "N"], count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
     """Rows drawn with replacement in proportion to their weights (any N, unlike torch.multinomial)."""
-    cumulative = weights.double().cumsum(0)
+    cumulative = weights.cpu().double().cumsum(0)  # a GPU adds up in an order of its own
     points = torch.rand(count, dtype=torch.float64, generator=generator) * cumulative[-1]
-    return torch.searchsorted(cumulative, points, right=True).clamp_max(len(weights) - 1)
+    return torch.searchsorted(cumulative, points, right=True).clamp_max(len(weights) - 1).to(weights.device)

@@ -91,7 +91,7 @@ class ShortRun:
         trainer = self.trained(left_out.scene, setup)
         target = Targets([left_out.view], WHITE, 0).get(0, trainer.plan.schedule.downscale(1), WHITE)
         colors = self.backend.forward(trainer.model.gaussians, target.camera, trainer.settings(), WHITE).colors
-        return colors.clamp(0, 1), target.colors
+        return colors.clamp(0, 1).cpu(), target.colors
 
 
 def evaluate_guidance(config: TrainConfig, scene: Scene, backend: Backend, setup: GuidanceSetup) -> Verdict:

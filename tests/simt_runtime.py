@@ -58,9 +58,10 @@ class SimtRuntime:
     """Runs the kernels in this process."""
 
     name = "simt"
-    device = torch.device("cpu")
 
-    def __init__(self, lockstep: int = 32, backwards: bool = False) -> None:
+    def __init__(self, lockstep: int = 32, backwards: bool = False, device: str = "cpu") -> None:
+        """`device`: where the tensors say that they lie (pretend_gpu.py)."""
+        self.device = torch.device(device)
         self.about = {"lockstep": str(lockstep)}
         self._order = Order.of(lockstep, backwards)
         self._library = library()

@@ -1,0 +1,62 @@
+"""The memory that a run takes on its GPU, estimated before the first step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from gsopt.errors import NumericalError
+
+TILES_PER_SPLAT = 6
+"""Tiles of 16 px that a splat touches on average; scenes of the kernel benchmark have 2 to 6."""
+ENTRY_BYTES = 96
+"""A pair of a splat and a tile: its row of sums, its number, and what the sort takes."""
+SPLAT_BYTES = 160
+"""A splat: its record, keys, slots, and what the sort takes."""
+PIXEL_BYTES = 120
+"""A pixel: the image, its gradient, the loss's maps and a target."""
+CONTEXT_BYTES = 600_000_000
+"""CUDA's own, with the kernels' code."""
+PRIOR_BYTES = 1_000_000_000
+"""A step of Stable Diffusion at 512 px (docs/howto/guidance.md), beside weights that are loaded by then."""
+COPIES = 6
+"""Parameters, gradients, two moments, and two more of the largest while rows are added."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Bytes that a run needs, in parts."""
+
+    gaussians: int
+    pixels: int
+    targets: int
+    prior: int
+
+    @staticmethod
+    def of(count: int, sh_degree: int, pixels: int, targets: int, prior: int = 0) -> Memory:
+        """`count` Gaussians at most, images of so many `pixels`, `targets` and `prior` bytes beside them."""
+        floats = 11 + 3 * (sh_degree + 1) ** 2
+        return Memory(
+            count * (4 * floats * COPIES + SPLAT_BYTES + ENTRY_BYTES * TILES_PER_SPLAT),
+            pixels * PIXEL_BYTES,
+            targets,
+            prior,
+        )
+
+    @property
+    def total(self) -> int:
+        """All parts, and what CUDA takes for itself."""
+        return self.gaussians + self.pixels + self.targets + self.prior + CONTEXT_BYTES
+
+    def require(self, device: torch.device, free: int) -> None:
+        """Raises NumericalError, with what to lower, where `free` bytes do not suffice."""
+        if self.total <= free:
+            return
+        parts = [("Gaussians", self.gaussians), ("images", self.pixels + self.targets), ("the prior", self.prior)]
+        told = ", ".join(f"{size / 1e9:.1f} GB for {what}" for what, size in parts if size)
+        raise NumericalError(
+            f"This run needs about {self.total / 1e9:.1f} GB on {device} ({told}), which has {free / 1e9:.1f} GB free. "
+            "Lower --max-gaussians, scale the images down (-r 2), take another GPU (--device cuda:1), or use "
+            "--backend cpu."
+        )
