@@ -114,6 +114,8 @@ def started_line(event: Mapping[str, Any], run: Path) -> str:
     few = " (few: regularizers on)" if event["sparse"] else ""
     if mirrors := event["mirrors"]:
         few += f", symmetric: every view counts once more behind {mirrors} mirror{'s' * (mirrors != 1)}"
+    if turns := event.get("turns"):
+        few += f", the same after every of {turns + 1} turns about an axis: every view counts from {turns} more sides"
     if guessed := event.get("guessed"):
         few += f", one photo: {guessed} guessed views of its inflated silhouette"
     begin = f"resumed at step {event['step']}" if event["step"] else f"init {event['init']}"

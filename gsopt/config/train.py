@@ -186,7 +186,8 @@ class SparseConfig:
     sh_degree: ShDegree = 2
     """Upper bound on the bands."""
     symmetry: Literal["auto", "off"] = "auto"
-    """Search for the mirror planes of an object with masks; a run learns from the mirror images of its photos too."""
+    """Search for the mirror planes of an object with masks, from one to three photos for its upright axis or mirrors; a
+    run learns from the images that its photos have there too."""
     inflate: Literal["auto", "off"] = "auto"
     """Completion of an object that one photo with a mask shows: its silhouette is inflated to a body, and a run learns
     from views of that body from other sides too."""

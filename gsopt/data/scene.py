@@ -90,7 +90,7 @@ class Scene:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from every source position; not zero only where coordinates were too large for float32."""
     mirrored: tuple[View, ...] = ()
-    """Mirror images of the input views, where the object is symmetric."""
+    """Images of the input views behind mirrors or turned about an axis, where the object is symmetric."""
     guessed: tuple[View, ...] = ()
     """Views of the shape that a single photo suggests (gsopt/init/inflation.py)."""
 
@@ -103,6 +103,11 @@ class Scene:
     def drawn(self) -> tuple[View, ...]:
         """The views a training step draws from: those that count as evidence, then guesses."""
         return self.observed + self.guessed
+
+    @property
+    def completed(self) -> bool:
+        """True when a single photo is completed by images that nobody took."""
+        return len(self.train) == 1 and len(self.drawn) > 1
 
     @property
     def extent(self) -> float:

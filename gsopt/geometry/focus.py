@@ -19,6 +19,8 @@ ROLL_DAMPING = 1e-3
 It tilts a well-settled up by about 1e-4; less of it would let the roll of a shaky hand decide in a narrow capture."""
 LEAST_UP_COSINE = 0.5
 """Between the up direction and the cameras' mean up: at more than 60 degrees the mean up is taken."""
+MAX_ROLL = 0.05
+"""Vertical component of a camera's right axis up to which the world's z axis counts as up."""
 _IN_FRONT = 0.8
 """Share of the cameras that must have the focus before them."""
 
@@ -57,6 +59,14 @@ def find_focus(cameras: list[Cameras], extent: float) -> Focus:
     distances = (point - centers).norm(dim=-1).clamp(min=1e-6)
     radii = distances * torch.tensor(half_views, dtype=torch.float64)
     return Focus(point.float(), float(distances.median()), float(radii.median()), converging)
+
+
+def world_up(viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "3"]:
+    """The z axis, as datasets of objects have it, unless a camera is rolled against it; else the cameras' own up."""
+    right, down = viewmats[:, 0, :3], viewmats[:, 1, :3]
+    if float(right[:, 2].abs().max()) <= MAX_ROLL and float(down[:, 2].max()) < 0:
+        return torch.tensor([0.0, 0.0, 1.0])
+    return up_direction(viewmats).float()
 
 
 def nearest_to_axes(centers: Float[Tensor, "C 3"], axes: Float[Tensor, "C 3"], damping: float) -> Float[Tensor, "3"]:

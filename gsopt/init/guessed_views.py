@@ -12,9 +12,10 @@ from torch import Tensor
 from gsopt.data.scene import Scene, View
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras, look_at
+from gsopt.geometry.focus import world_up
 from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.geometry.voxels import Grid
-from gsopt.init.inflation import inflated, object_box, world_up
+from gsopt.init.inflation import inflated, object_box
 from gsopt.init.surface_colors import unoccluded_colors
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.backend import Backend, RasterSettings
@@ -62,7 +63,7 @@ def surrounding_cameras(photo: Thumbnail, extent: float) -> Cameras:
     number = torch.arange(COUNT) + 0.5
     height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * number / COUNT
     angle, level = number * GOLDEN_ANGLE, (1 - height**2).sqrt()
-    up = world_up(photo.camera)
+    up = world_up(photo.camera.viewmats)
     ahead = torch.linalg.cross(up, photo.camera.viewmats[0, 0, :3])
     ahead = ahead / ahead.norm()
     aside = torch.linalg.cross(up, ahead)

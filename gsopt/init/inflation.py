@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gsopt.geometry.cameras import Cameras
-from gsopt.geometry.focus import find_focus, up_direction
+from gsopt.geometry.focus import find_focus, world_up
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
 from gsopt.init.rounded_hull import RADIUS_RATIO, squared_distance
@@ -34,8 +34,6 @@ MARGIN = 1.25
 """Half side of the grid over the half diagonal of the silhouette's box: room for a tilted body."""
 MAX_DISTANCE_SIDE = 200
 """Longer side of the mask that distances are taken in, px: `squared_distance` is exact up to 90."""
-MAX_ROLL = 0.05
-"""Vertical component of the camera's right axis up to which the world's z axis counts as up."""
 
 
 def inflated(photo: Thumbnail, extent: float) -> Grid | None:
@@ -88,17 +86,9 @@ def object_box(camera: Cameras, solid: Bool[Tensor, "H W"], extent: float) -> tu
 
 def plane_normal(camera: Cameras) -> Float[Tensor, "3"]:
     """The normal of the plane that the object is inflated about: level, or up where the camera looks steeply down."""
-    axis, up = camera.forwards[0], world_up(camera)
+    axis, up = camera.forwards[0], world_up(camera.viewmats)
     level = axis - (axis @ up) * up
     return up if float((axis @ up).abs()) > math.sin(STEEP) else level / level.norm()
-
-
-def world_up(camera: Cameras) -> Float[Tensor, "3"]:
-    """The z axis, as datasets of objects have it, unless the camera is rolled against it; else the photo's own up."""
-    right, down = camera.viewmats[0, 0, :3], camera.viewmats[0, 1, :3]
-    if float(right[2].abs()) <= MAX_ROLL and float(down[2]) < 0:
-        return torch.tensor([0.0, 0.0, 1.0])
-    return up_direction(camera.viewmats).float()
 
 
 def silhouette_distances(solid: Bool[Tensor, "H W"]) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:

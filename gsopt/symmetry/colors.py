@@ -9,6 +9,7 @@ from torch import Tensor
 from gsopt.geometry.voxels import Grid
 from gsopt.init.surface_colors import seen_colors
 from gsopt.init.thumbnails import Thumbnail
+from gsopt.symmetry.axis import Axis
 from gsopt.symmetry.mirror import Mirror
 
 MIN_DISTANCE = 0.1
@@ -19,12 +20,12 @@ MIN_PAIRS = 50
 """Pairs of points below which nothing is known."""
 
 
-def disagreement(grid: Grid, photos: list[Thumbnail], mirror: Mirror, radius: float) -> float:
+def disagreement(grid: Grid, photos: list[Thumbnail], mirror: Mirror | Axis, radius: float) -> float:
     """Mean squared difference between the colors of mirror images on a shape's surface, where photos show both, over
     the same between two random points: 0 when all is symmetric, 1 when nothing is, or nothing is known."""
     surface = grid.surface()
     points = surface[mirror.distance(surface) > MIN_DISTANCE * radius]
-    colors, seen = seen_colors(grid, photos, torch.cat([points, mirror.reflect(points)]))
+    colors, seen = seen_colors(grid, photos, torch.cat([points, next(iter(mirror.images(points)))]))
     here, there = colors.chunk(2)
     both = torch.logical_and(*seen.chunk(2))
     if int(both.sum()) < MIN_PAIRS:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +21,8 @@ class Mirror:
     """Unit vector."""
     offset: float
     """Scene units."""
+    freedom: ClassVar[int] = 3
+    """Numbers that `moved` takes."""
 
     def distance(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
         """Signed, scene units; written out by coordinate, so that no matrix product's blocking decides the last bit."""
@@ -28,6 +32,10 @@ class Mirror:
     def reflect(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Mirror images of the points."""
         return points - 2 * self.distance(points)[..., None] * self.normal
+
+    def images(self, points: Float[Tensor, "*N 3"]) -> Iterator[Float[Tensor, "*N 3"]]:
+        """The one mirror image of the points."""
+        yield self.reflect(points)
 
     def camera(self, camera: Cameras) -> Cameras:
         """The camera's mirror image. Its view of a symmetric object is the camera's photo, read from right to
@@ -41,3 +49,12 @@ class Mirror:
         Ks = camera.Ks.clone()
         Ks[:, 0, 2] = camera.width - Ks[:, 0, 2]
         return replace(camera, viewmats=viewmats, Ks=Ks)
+
+    def moved(self, change: Float[Tensor, "3"], center: Float[Tensor, "3"], radius: float) -> Mirror:
+        """The plane turned about a center by two small angles and shifted by a share of the radius."""
+        n = self.normal
+        axis = torch.eye(3)[int(n.abs().numpy().argmin())]
+        u = torch.nn.functional.normalize(torch.linalg.cross(n, axis), dim=0)
+        normal = torch.nn.functional.normalize(n + change[0] * u + change[1] * torch.linalg.cross(n, u), dim=0)
+        shift = self.offset - float(n @ center) + float(change[2]) * radius
+        return Mirror(normal, float(normal @ center) + shift)

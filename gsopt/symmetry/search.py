@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -12,6 +13,7 @@ from torch import Tensor
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated
 from gsopt.init.thumbnails import Thumbnail
+from gsopt.symmetry.axis import Axis, perpendicular
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import Silhouettes
 
@@ -34,6 +36,7 @@ LEAST_GAIN, LEAST_STEP = 0.995, 3e-4
 GIVE_UP_AT, GIVE_UP_ABOVE = 4, 3.0
 """It is abandoned when this many steps leave more than so many times the accepted misses."""
 _CHUNK = 32
+M = TypeVar("M", Mirror, Axis)
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,11 @@ def bounding_ball(grid: Grid) -> Ball:
     return Ball(center, float((cells - center).norm(dim=1).max()) + grid.voxel)
 
 
-def candidates(grid: Grid, photos: list[Thumbnail], ball: Ball) -> list[Mirror]:
-    """Up to MAX_CANDIDATES planes, best first: those that leave least of the silhouettes unexplained when the hull is
-    cut with its mirror image."""
-    normals = half_sphere(DIRECTIONS)
+def candidates(
+    grid: Grid, photos: list[Thumbnail], ball: Ball, normals: Float[Tensor, "D 3"], apart: float
+) -> list[Mirror]:
+    """Up to MAX_CANDIDATES planes with these normals, best first: those that leave least of the silhouettes unexplained
+    when the hull is cut with its mirror image."""
     shifts = torch.linspace(-MAX_OFFSET, MAX_OFFSET, OFFSETS) * ball.radius
     middle = (normals * ball.center).sum(1)
     offsets = (middle[:, None] + shifts).flatten()
@@ -64,7 +68,7 @@ def candidates(grid: Grid, photos: list[Thumbnail], ball: Ball) -> list[Mirror]:
         if len(found) == MAX_CANDIDATES or float(lost[row]) > MAX_UNCOVERED:
             break
         mirror = Mirror(normals[row], float(offsets[row]))
-        if not any(same(mirror, other, CANDIDATE_ANGLE) for other in found):
+        if not any(same(mirror, other, apart) for other in found):
             found.append(mirror)
     return found
 
@@ -80,6 +84,13 @@ def half_sphere(count: int) -> Float[Tensor, "N 3"]:
     z, turn = row / count, row * math.pi * (3 - math.sqrt(5))
     ring = (1 - z**2).sqrt()
     return torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)
+
+
+def half_circle(count: int, up: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
+    """Evenly spread directions across `up`."""
+    u = perpendicular(up)
+    angles = math.pi * torch.arange(count) / count
+    return angles.cos()[:, None] * u + angles.sin()[:, None] * torch.linalg.cross(up, u)
 
 
 def joined(grid: Grid, factor: int) -> Grid:
@@ -141,9 +152,9 @@ def _uncovered_share(rows: Tensor, pixel: Tensor, stays: Bool[Tensor, "M P"]) ->
     return 1 - covered.mean(0)
 
 
-def refined(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[Mirror, float]:
-    """The plane moved to where the outlines miss least (Levenberg-Marquardt over two tilts and the offset), and the
-    root mean square of what is left, px. A plane that stays far from `wanted` is given up."""
+def refined(mirror: M, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[M, float]:
+    """The plane or axis moved to where the outlines miss least (Levenberg-Marquardt over what `moved` takes), and the
+    root mean square of what is left, px. One that stays far from `wanted` is given up."""
     misses, damping = silhouettes.misses(mirror), 1e-2
     for iteration in range(MAX_STEPS):
         if iteration == GIVE_UP_AT and _rms(misses) > GIVE_UP_ABOVE * wanted:
@@ -153,7 +164,7 @@ def refined(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, wanted: float)
         step = None
         for _ in range(MAX_DAMPINGS):
             tried = -torch.linalg.solve(A + damping * torch.diag(A.diagonal() + 1e-6), b)
-            moved = _moved(mirror, tried, ball)
+            moved = mirror.moved(tried, ball.center, ball.radius)
             left = silhouettes.misses(moved)
             if _rms(left) < LEAST_GAIN * _rms(misses):
                 step, mirror, misses, damping = tried, moved, left, max(damping / 4, 1e-6)
@@ -168,20 +179,10 @@ def _rms(misses: Float[Tensor, "P"]) -> float:
     return float(misses.square().mean().sqrt())
 
 
-def _jacobian(mirror: Mirror, silhouettes: Silhouettes, ball: Ball, step: float = 2e-3) -> Float[Tensor, "P 3"]:
-    """d(misses)/d(tilt, tilt, shift) by central differences."""
+def _jacobian(mirror: M, silhouettes: Silhouettes, ball: Ball, step: float = 2e-3) -> Float[Tensor, "P D"]:
+    """d(misses)/d(change) by central differences."""
     columns = []
-    for change in step * torch.eye(3):
-        ahead, behind = (silhouettes.misses(_moved(mirror, way * change, ball)) for way in (1, -1))
+    for change in step * torch.eye(mirror.freedom):
+        ahead, behind = (silhouettes.misses(mirror.moved(way * change, ball.center, ball.radius)) for way in (1, -1))
         columns.append((ahead - behind) / (2 * step))
     return torch.stack(columns, 1)
-
-
-def _moved(mirror: Mirror, change: Float[Tensor, "3"], ball: Ball) -> Mirror:
-    """The plane turned about the ball's center by two small angles (radians) and shifted by a share of its radius."""
-    n = mirror.normal
-    axis = torch.eye(3)[int(n.abs().numpy().argmin())]
-    u = torch.nn.functional.normalize(torch.linalg.cross(n, axis), dim=0)
-    normal = torch.nn.functional.normalize(n + change[0] * u + change[1] * torch.linalg.cross(n, u), dim=0)
-    shift = mirror.offset - float(n @ ball.center) + float(change[2]) * ball.radius
-    return Mirror(normal, float(normal @ ball.center) + shift)

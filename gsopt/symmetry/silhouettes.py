@@ -20,6 +20,7 @@ from torch import Tensor
 from gsopt.geometry.projection import project
 from gsopt.init.rounded_hull import squared_distance
 from gsopt.init.thumbnails import Thumbnail, sample
+from gsopt.symmetry.axis import Axis
 from gsopt.symmetry.mirror import Mirror
 
 RAYS_PER_PHOTO = 120
@@ -83,7 +84,7 @@ class Silhouettes:
         """False for opaque photos, whose alpha has no edge."""
         return len(self._origins) >= MIN_RAYS * len(self.outlines)
 
-    def misses(self, mirror: Mirror) -> Float[Tensor, "R"]:
+    def misses(self, mirror: Mirror | Axis) -> Float[Tensor, "R"]:
         """(1) for the rays of all photos, px, at most MAX_MISS."""
         smallest = torch.full(self._kept.shape, -float(MAX_DISTANCE))
         smallest[self._kept] = torch.minimum(self._kept_others, self._behind(mirror, self._kept_points))
@@ -104,12 +105,12 @@ class Silhouettes:
             smallest = torch.where(own == index, smallest, torch.minimum(smallest, outline.at(points)))
         return smallest
 
-    def _behind(self, mirror: Mirror, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
-        """The smallest signed distance of the mirror image in all photos."""
-        reflected = mirror.reflect(points)
+    def _behind(self, mirror: Mirror | Axis, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
+        """The smallest signed distance of the points' images in all photos."""
         smallest = torch.full(points.shape[:-1], float(MAX_DISTANCE))
-        for outline in self.outlines:
-            smallest = torch.minimum(smallest, outline.at(reflected))
+        for image in mirror.images(points):
+            for outline in self.outlines:
+                smallest = torch.minimum(smallest, outline.at(image))
         return smallest
 
 

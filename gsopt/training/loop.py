@@ -81,7 +81,7 @@ def train(
         with one_torch_thread(), on_its_gpu(backend):
             scene = load_scene(config.data)
             scene = with_recorded_mirrors(config, scene, directory)
-            if guesses(config, len(scene.train)):
+            if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)
             plan = RunPlan.of(config, scene)
             guidance = start_guidance(config, plan, scene, backend, directory)
@@ -222,7 +222,8 @@ def _start(
         n=len(trainer.model),
         train_views=len(names),
         test_views=len(scene.test),
-        mirrors=len(scene.mirrored) // len(names),
+        mirrors=sum(view.mirrored for view in scene.mirrored) // len(names),
+        turns=sum(not view.mirrored for view in scene.mirrored) // len(names),
         guessed=len(scene.guessed),
         sparse=plan.sparse,
         guidance=directory.recorded("guidance"),
@@ -241,6 +242,11 @@ def few_photo_warnings(scene: Scene) -> tuple[str, ...]:
         return (
             f"{len(scene.train)} input views without masks: sides that they do not show cannot be completed. Add alpha "
             "or a folder masks/ (docs/howto/photos.md), or more photos.",
+        )
+    if scene.completed and not scene.guessed:
+        return (
+            "One photo shows one side: the other sides are a guess. The silhouette is that of a thing which looks the "
+            "same from all around an upright axis, and that is assumed. A second photo from the side tells.",
         )
     if scene.guessed:
         return (

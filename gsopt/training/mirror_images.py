@@ -1,18 +1,19 @@
-"""Before the first step: the mirrors of the object, found once, then kept with the run."""
+"""Before the first step: the symmetries of the object, found once, then kept with the run."""
 
 from __future__ import annotations
 
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
-from gsopt.symmetry.find import Symmetry, find_symmetries, with_mirror_images
+from gsopt.symmetry.find import find_symmetries, with_mirror_images
+from gsopt.symmetry.symmetry import Symmetry
 from gsopt.training.plan import is_sparse
 from gsopt.training.run_directory import RunDirectory
 
 
 def symmetries(config: TrainConfig, scene: Scene) -> list[Symmetry]:
-    """The mirrors this run uses: none unless the photos are few and all have alpha. Not while poses are corrected:
-    their errors would go into the mirrors."""
+    """The symmetries this run uses: none unless the photos are few and all have alpha. Not while poses are corrected:
+    their errors would go into them."""
     few = is_sparse(config.sparse, len(scene.train))
     wanted = few and config.sparse.symmetry == "auto" and not config.poses.refine
     return find_symmetries(scene) if wanted else []

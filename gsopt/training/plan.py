@@ -91,7 +91,7 @@ class RunPlan:
         """Resolves the settings against a scene, mirror images included."""
         views = len(scene.train)
         sparse = is_sparse(config.sparse, views)
-        iterations = shortened(config, 2 * views if scene.guessed else views)
+        iterations = shortened(config, 2 * views if scene.completed else views)
         background = Background.of(config.data)
         budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), iterations)
         schedule = make_schedule(config, iterations, sparse, scene.extent)
@@ -213,6 +213,6 @@ def default_budget(pixels: float, iterations: int) -> int:
 
 
 def extra_per_epoch(scene: Scene) -> int:
-    """Number of mirror images or guessed views drawn beside every input view once: as many guesses as photos."""
+    """Number of mirror images or guessed views drawn beside every input view once: one beside a single photo."""
     views = len(scene.train)
-    return views if scene.guessed else min(len(scene.mirrored), round(MIRRORED_TIMES_VIEWS / views))
+    return views if scene.completed else min(len(scene.mirrored), round(MIRRORED_TIMES_VIEWS / views))

@@ -15,9 +15,10 @@ from gsopt.data.scene import Scene, load_scene
 from gsopt.geometry.voxels import Grid
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.symmetry.colors import MIN_PAIRS, disagreement
-from gsopt.symmetry.find import MAX_DISAGREEMENT, MAX_MISSES, Symmetry, find_symmetries, with_mirror_images
+from gsopt.symmetry.find import MAX_MISSES, find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import MAX_DISTANCE, Outline, Silhouettes, outline_pixels, signed_distance
+from gsopt.symmetry.symmetry import MAX_DISAGREEMENT, Symmetry
 
 HALF = [Ball((0.5, 0.1, 0.0), 0.35), Ball((0.35, 0.5, 0.3), 0.2, (40, 90, 220)), Ball((0.6, -0.4, -0.2), 0.15)]
 """Beside the plane x = 0; with their mirror images nothing else about them is symmetric."""
@@ -40,9 +41,9 @@ def scene_of(folder: Path, balls: list[Ball], views: int = 4) -> Scene:
 def test_the_mirror_of_a_symmetric_thing_is_found(mirror: Mirror, tmp_path: Path) -> None:
     found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, mirror)))
     assert len(found) == 1
-    assert degrees_between(found[0].mirror, mirror) < 1
+    assert degrees_between(found[0].element, mirror) < 1
     middle = torch.zeros(3) + mirror.offset * mirror.normal
-    assert abs(float(found[0].mirror.distance(middle))) < 0.02
+    assert abs(float(found[0].element.distance(middle))) < 0.02
     assert found[0].misses <= MAX_MISSES / 4
     assert found[0].colored
 
@@ -56,12 +57,12 @@ def test_a_thing_with_two_mirrors_has_both(tmp_path: Path) -> None:
     quarter = [Ball((0.4, 0.3, 0.2), 0.3), Ball((0.6, 0.2, -0.3), 0.2), Ball((0.2, 0.5, -0.5), 0.15)]
     found = find_symmetries(scene_of(tmp_path / "thing", mirrored(mirrored(quarter, x), y)))
     assert len(found) == 2
-    assert all(min(degrees_between(symmetry.mirror, mirror) for symmetry in found) < 1 for mirror in (x, y))
+    assert all(min(degrees_between(symmetry.element, mirror) for symmetry in found) < 1 for mirror in (x, y))
 
 
 def test_paint_that_is_not_symmetric_is_noticed(tmp_path: Path) -> None:
     found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, slanted(), repaint=True)))
-    assert [degrees_between(symmetry.mirror, slanted()) < 1 for symmetry in found] == [True]
+    assert [degrees_between(symmetry.element, slanted()) < 1 for symmetry in found] == [True]
     assert found[0].disagreement > MAX_DISAGREEMENT
     assert not found[0].colored
 
@@ -98,7 +99,7 @@ def test_candidates_that_end_in_one_mirror_are_one(tmp_path: Path, monkeypatch: 
     ]
     monkeypatch.setattr("gsopt.symmetry.find.candidates", lambda *args: tilted)
     found = find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, slanted())))
-    assert [degrees_between(symmetry.mirror, slanted()) < 1 for symmetry in found] == [True]
+    assert [degrees_between(symmetry.element, slanted()) < 1 for symmetry in found] == [True]
 
 
 @pytest.mark.parametrize(("side", "known"), [(3, False), (12, True)])
@@ -118,7 +119,7 @@ def test_twice_the_same_bits(tmp_path: Path) -> None:
     assert first == second
     again = Symmetry.from_dict(first[0])
     assert again.to_dict() == first[0]
-    assert torch.equal(again.mirror.normal, Symmetry.from_dict(second[0]).mirror.normal)
+    assert torch.equal(again.element.normal, Symmetry.from_dict(second[0]).element.normal)
 
 
 def test_mirror_images_are_flipped_photos_seen_from_behind(tmp_path: Path) -> None:

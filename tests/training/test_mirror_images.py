@@ -22,8 +22,9 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.metrics import psnr
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
-from gsopt.symmetry.find import Symmetry, with_mirror_images
+from gsopt.symmetry.find import with_mirror_images
 from gsopt.symmetry.mirror import Mirror
+from gsopt.symmetry.symmetry import Symmetry
 from gsopt.training.guided.guard import without
 from gsopt.training.loop import train
 from gsopt.training.targets import Targets

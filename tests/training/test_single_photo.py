@@ -18,12 +18,12 @@ from gsopt.raster.backend import RasterSettings
 from gsopt.training.loop import TrainResult, few_photo_warnings, train
 from gsopt.training.plan import RunPlan
 
-BALL = [Ball((0.0, 0.0, 0.0), 0.6, (200, 60, 30))]
+BALL = [Ball((0.1, 0.0, 0.0), 0.6, (200, 60, 30)), Ball((-0.5, 0.2, 0.3), 0.25, (200, 60, 30))]
 
 
 @pytest.fixture(scope="module")
 def one_photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball, seen by one camera; seven others are held out."""
+    """Two balls, as no axis has them, seen by one camera; seven others are held out."""
     around = ring(8, size=48)
     return write_balls(tmp_path_factory.mktemp("one") / "ball", BALL, around[0], around[1:])
 

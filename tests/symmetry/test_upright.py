@@ -1,0 +1,117 @@
+"""One to three photos prove an upright axis or an upright mirror, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from balls import Ball, mirrored, ring, write_balls
+
+from gsopt.data.scene import Scene, load_scene
+from gsopt.errors import InputError
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import project
+from gsopt.symmetry.axis import Axis
+from gsopt.symmetry.find import find_symmetries, with_mirror_images
+from gsopt.symmetry.mirror import Mirror
+from gsopt.symmetry.symmetry import Symmetry
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+BOTTLE = [Ball((0.1, -0.05, -0.4), 0.45), Ball((0.1, -0.05, 0.1), 0.3), Ball((0.1, -0.05, 0.5), 0.2, (40, 90, 220))]
+HANDLE = Ball((-0.06, 0.48, -0.1), 0.15)
+HALF = [Ball((0.5, 0.1, 0.0), 0.35), Ball((0.35, 0.5, 0.3), 0.2, (40, 90, 220)), Ball((0.6, -0.4, -0.2), 0.15)]
+LOPSIDED = [*HALF, Ball((-0.4, 0.0, 0.5), 0.3), Ball((-0.2, -0.5, -0.4), 0.25)]
+
+
+def scene_of(folder: Path, balls: list[Ball], views: int, turn: float = 0.3) -> Scene:
+    around = ring(7, elevation=0.4, size=160, turn=turn)
+    return load_scene(write_balls(folder, balls, Cameras.cat([around[row] for row in (0, 2, 3)[:views]])))
+
+
+def axis() -> Axis:
+    return Axis(UP, torch.tensor([0.1, -0.05, 0.0]), 8)
+
+
+@pytest.mark.parametrize("views", [1, 2, 3])
+def test_the_axis_of_a_round_thing_is_found(views: int, tmp_path: Path) -> None:
+    scene = scene_of(tmp_path / "bottle", BOTTLE, views)
+    (found,) = find_symmetries(scene)
+    assert isinstance(found.element, Axis)
+    assert found.element.turns == 8
+    off = found.element.point - axis().point
+    seen = scene.train[0].camera.forwards[0] if views == 1 else UP  # a single photo leaves the distance open
+    across = torch.linalg.cross(torch.nn.functional.normalize(seen * torch.tensor([1.0, 1, views > 1]), dim=0), off)
+    assert float(across[2].abs() if views == 1 else across.norm()) < 0.01
+    assert found.colored
+
+
+def test_a_hexagon_is_not_round_but_has_its_axis(tmp_path: Path) -> None:
+    angles = [2 * math.pi * corner / 6 for corner in range(6)]
+    crown = [Ball((0.7 * math.cos(a), 0.7 * math.sin(a), 0.0), 0.2) for a in angles]
+    (found,) = find_symmetries(scene_of(tmp_path / "crown", crown, 2))
+    assert isinstance(found.element, Axis)
+    assert found.element.turns == 6
+
+
+@pytest.mark.parametrize("views", [1, 2, 3])
+def test_a_handle_is_seen_and_nothing_is_believed_of_a_lopsided_thing(views: int, tmp_path: Path) -> None:
+    found = find_symmetries(scene_of(tmp_path / "jug", [*BOTTLE, HANDLE], views))
+    assert not any(isinstance(symmetry.element, Axis) for symmetry in found)
+    assert len(found) < views
+    assert find_symmetries(scene_of(tmp_path / "thing", LOPSIDED, views)) == []
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_an_upright_mirror_is_found_and_a_tilted_one_is_not_believed(views: int, tmp_path: Path) -> None:
+    upright = Mirror(torch.tensor([0.8, 0.6, 0.0]), 0.05)
+    (found,) = find_symmetries(scene_of(tmp_path / "upright", mirrored(HALF, upright), views))
+    assert isinstance(found.element, Mirror)
+    assert abs(float(found.element.normal @ upright.normal)) > math.cos(math.radians(1))
+    assert found.colored
+    tilted = Mirror(torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.5]), dim=0), 0.05)
+    assert find_symmetries(scene_of(tmp_path / "tilted", mirrored(HALF, tilted), views)) == []
+
+
+def test_a_single_photo_proves_no_mirror(tmp_path: Path) -> None:
+    upright = Mirror(torch.tensor([0.8, 0.6, 0.0]), 0.05)
+    assert find_symmetries(scene_of(tmp_path / "thing", mirrored(HALF, upright), 1)) == []
+
+
+def test_a_turned_camera_sees_the_turned_point_where_the_camera_saw_the_point() -> None:
+    camera, points = ring(1)[0], torch.rand(20, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    slanted = Axis(torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.2, 0.1, -0.3]), 6)
+    before = torch.stack(project(camera, points))
+    pairs = list(zip(slanted.cameras(camera), slanted.images(points), strict=True))
+    assert len(pairs) == 5
+    for turned, image in pairs:
+        assert torch.allclose(torch.stack(project(turned, image)), before, atol=1e-3)
+        assert not torch.allclose(image, points, atol=0.01)
+    half = 2 * (slanted.point + _along(slanted, points)) - points
+    assert torch.allclose(pairs[2][1], half, atol=1e-5)
+
+
+def _along(axis: Axis, points: torch.Tensor) -> torch.Tensor:
+    return ((points - axis.point) @ axis.direction)[:, None] * axis.direction
+
+
+def test_images_of_one_photo_have_colors_even_where_the_paint_differs(tmp_path: Path) -> None:
+    painted = Symmetry(axis(), 0.0, 1.0)
+    one, two = (with_mirror_images(scene_of(tmp_path / str(n), BOTTLE, n), [painted]) for n in (1, 2))
+    assert [len(scene.mirrored) for scene in (one, two)] == [7, 14]
+    assert {view.color for view in two.mirrored} == {0.0}
+    assert all(0 < view.color < 1 for view in one.mirrored)
+    assert not any(view.mirrored for view in one.mirrored)
+    assert one.completed
+    assert not two.completed
+
+
+def test_a_record_gives_the_same_axis_and_a_garbled_one_an_error() -> None:
+    record = Symmetry(axis(), 0.001, 0.2).to_dict()
+    again = Symmetry.from_dict(record)
+    assert again.to_dict() == record
+    assert "8 turns about an upright axis" in record["about"]
+    for change in ({"turns": 1}, {"turns": 10**9}, {"turns": True}, {"point": [0, 0]}, {"direction": [0, 0, 2]}):
+        with pytest.raises(InputError, match="the axis"):
+            Symmetry.from_dict(record | change)
