@@ -59,15 +59,21 @@ def open_run(run: Path, backend: str | None = None, threads: int | None = None) 
         path=run,
         config=config,
         gaussians=gaussians,
-        backend=_backend(config, backend, threads),
+        backend=backend_of(config, backend, threads),
         settings=RasterSettings(sh_degree=gaussians.sh_degree, antialiased=config.antialiased),
-        background=torch.tensor(config.data.evaluation_background),
+        background=background_of(config),
     )
 
 
-def _backend(config: TrainConfig, backend: str | None, threads: int | None) -> Backend:
+def backend_of(config: TrainConfig, backend: str | None = None, threads: int | None = None) -> Backend:
+    """The backend that a run was configured with, or another one."""
     device = config.device if backend in (None, config.backend) else ""
     return make_backend(backend or config.backend, config.threads if threads is None else threads, device)
+
+
+def background_of(config: TrainConfig) -> Float[Tensor, "3"]:
+    """The background that held-out views are evaluated on."""
+    return torch.tensor(config.data.evaluation_background)
 
 
 def draw(

@@ -3,78 +3,44 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.config.train import TrainConfig
-from gsopt.data.scene import load_scene
+from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError, UsageError
-from gsopt.events import LAST, read_events
 from gsopt.formats import load_splats
+from gsopt.formats.validation import MAX_SH_DEGREE
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.quats import from_rotation_matrices
 from gsopt.raster.reference import covariances
+from gsopt.results.finished_run import truth
+from gsopt.results.report.embedded_images import shrunk
+from gsopt.results.run_follower import RunFollower
+from gsopt.results.video import as_image
+from gsopt.results.viewer_controls import HeldOutViews, RunControls, held_out_views
 from gsopt.results.viewer_server import start_server
+from gsopt.results.web.scene import framed
 
 POLL_SECONDS = 0.5
-FRUSTUM_SIZE = 0.05
+PHOTO_SIDE = 160
+"""Longer side of a photo in its camera, px."""
+RECOLOR_SHARE = 0.03
+"""An eye that moved by this share of its distance to the splats sees other colors."""
+FRUSTUM_SIZE = 0.12
 """Length of a drawn camera as a fraction of the scene's radius."""
 MAX_COVARIANCE = 6e4
 """Just below the largest half float, the format of covariances in the browser."""
-
-
-@dataclass(frozen=True)
-class Update:
-    """A change to display."""
-
-    splats: Path | None
-    """File to load, or None when the event is only text."""
-    caption: str
-
-
-class RunFollower:
-    """Reads a run's new events and returns its newest splats."""
-
-    def __init__(self, run: Path) -> None:
-        self.run = run
-        self._offset = 0
-
-    def poll(self) -> Update | None:
-        """The newest update since the last call, or None; older previews are skipped."""
-        events, self._offset = read_events(self.run / "events.jsonl", self._offset)
-        updates = [update for event in events if (update := self._update(event)) is not None]
-        drawn = [update for update in updates if update.splats is not None]
-        if not updates:
-            return None
-        return Update(drawn[-1].splats if drawn else None, updates[-1].caption)
-
-    def _update(self, event: dict[str, Any]) -> Update | None:
-        kind = event.get("kind")
-        if kind == "preview":
-            step = event.get("step")
-            return Update(self._inside(event.get("path")), f"step {step}" if type(step) is int else "preview")
-        if kind in LAST:
-            return Update(self._inside("splat.ply"), str(kind))
-        return None
-
-    def _inside(self, name: object) -> Path | None:
-        """The file `name` of the run, or None when it is missing or outside the run directory."""
-        if not isinstance(name, str):
-            return None
-        try:
-            path = (self.run / name).resolve()
-            return path if path.is_relative_to(self.run.resolve()) and path.is_file() else None
-        except (OSError, ValueError, RuntimeError):  # too long, no text or a NUL, a circle of links
-            return None
 
 
 class SplatViewer:
@@ -84,9 +50,62 @@ class SplatViewer:
         self._server = start_server(host, port)
         # Not Markdown: viser runs the scripts in it, and a caption may hold the name of a stranger's file.
         self._caption = self._server.gui.add_text("splats", "waiting for the first ones", disabled=True)
-        show = self._server.gui.add_checkbox("input cameras", initial_value=True)
-        self._frames = self._server.scene.add_frame("/cameras", show_axes=False)
+        show = self._server.gui.add_checkbox("input cameras and photos", initial_value=False)
+        self._frames = self._server.scene.add_frame("/cameras", show_axes=False, visible=False)
         show.on_update(lambda _: setattr(self._frames, "visible", show.value))
+        self._lock = threading.Lock()
+        self._gaussians: Gaussians | None = None
+        self._splats: Any = None
+        self._scale, self._degree = 1.0, MAX_SH_DEGREE
+        self._eye = self._seen_from = torch.zeros(3)
+        self._add_look_controls()
+        self._server.on_client_connect(lambda client: client.camera.on_update(self._follow_eye))
+
+    def _add_look_controls(self) -> None:
+        gui = self._server.gui
+        scale = gui.add_slider("splat size", min=0.0, max=1.0, step=0.01, initial_value=1.0)
+        scale.on_update(lambda _: self.set_look(scale=float(scale.value)))
+        degree = gui.add_slider("SH degree", min=0, max=MAX_SH_DEGREE, step=1, initial_value=MAX_SH_DEGREE)
+        degree.on_update(lambda _: self.set_look(degree=int(degree.value)))
+        color = gui.add_rgb("background", initial_value=(255, 255, 255))
+        color.on_update(lambda _: self.set_background(color.value))
+
+    def set_background(self, color: tuple[int, ...]) -> None:
+        """Fills the space behind the splats with one color, 0 to 255."""
+        self._server.scene.set_background_image(np.full((2, 2, 3), color, np.uint8))
+
+    def set_look(self, scale: float | None = None, degree: int | None = None) -> None:
+        """Draws the splats smaller, to points at 0, or with fewer bands of their harmonics."""
+        self._scale = self._scale if scale is None else scale
+        self._degree = self._degree if degree is None else degree
+        with self._lock:
+            if self._gaussians is not None:
+                self._splats.covariances = self._covariances()
+                self._splats.rgbs = self._colors()
+
+    def _follow_eye(self, camera: Any) -> None:
+        self._eye = torch.tensor(camera.position, dtype=torch.float32)
+
+    def refresh(self) -> None:
+        """Colors the splats as they look from where the newest visitor is, if he moved."""
+        with self._lock:
+            gaussians = self._gaussians
+            if gaussians is None or not len(gaussians) or min(self._degree, gaussians.sh_degree) == 0:
+                return
+            reach = float((gaussians.means.median(dim=0).values - self._eye).norm())
+            if float((self._eye - self._seen_from).norm()) > RECOLOR_SHARE * reach:
+                self._splats.rgbs = self._colors()
+
+    def _covariances(self) -> Any:
+        assert self._gaussians is not None
+        sigma = covariances(self._gaussians.quats, self._gaussians.log_scales)
+        return (sigma * self._scale**2).clamp(-MAX_COVARIANCE, MAX_COVARIANCE).numpy()
+
+    def _colors(self) -> Any:
+        assert self._gaussians is not None
+        g, self._seen_from = self._gaussians, self._eye
+        directions = torch.nn.functional.normalize(g.means - self._eye, dim=1)
+        return sh.evaluate(g.sh0, g.shN, directions, min(self._degree, g.sh_degree)).clamp(0, 1).numpy()
 
     @property
     def port(self) -> int:
@@ -95,19 +114,23 @@ class SplatViewer:
         return port
 
     def show_splats(self, gaussians: Gaussians, caption: str) -> None:
-        """Replaces the splats. Colors are those of SH degree 0: the browser's renderer supports no other bands."""
-        sigma = covariances(gaussians.quats, gaussians.log_scales).clamp(-MAX_COVARIANCE, MAX_COVARIANCE)
-        self._server.scene.add_gaussian_splats(
-            "/splats",
-            centers=gaussians.means.numpy(),
-            covariances=sigma.numpy(),
-            rgbs=sh.rgb_from_sh0(gaussians.sh0[:, 0]).clamp(0, 1).numpy(),
-            opacities=gaussians.opacities[:, None].numpy(),
-        )
+        """Replaces the splats. The browser's renderer knows no harmonics: colors are those seen from one eye."""
+        with self._lock:
+            self._gaussians = gaussians
+            self._splats = self._server.scene.add_gaussian_splats(
+                "/splats",
+                centers=gaussians.means.numpy(),
+                covariances=self._covariances(),
+                rgbs=self._colors(),
+                opacities=gaussians.opacities[:, None].numpy(),
+            )
         self._caption.value = f"{caption}: {len(gaussians)} Gaussians".encode(errors="backslashreplace").decode()
 
-    def show_cameras(self, cameras: list[Cameras], radius: float) -> None:
-        """Adds a frustum per camera and turns their mean up axis up; `radius` of the scene sets their size."""
+    def show_cameras(self, cameras: list[Cameras], radius: float, photos: list[Any] | None = None) -> None:
+        """Adds a frustum per camera, its photo [H, W, 3] as the image plane, and turns their mean up axis up.
+
+        `radius` of the scene sets their size.
+        """
         self._server.scene.set_up_direction(tuple(mean_up(cameras).tolist()))
         for i, camera in enumerate(cameras):
             world_from_cam = torch.linalg.inv(camera.viewmats[0].double())
@@ -117,14 +140,29 @@ class SplatViewer:
                 aspect=camera.width / camera.height,
                 scale=FRUSTUM_SIZE * radius,
                 thickness=0.02 * FRUSTUM_SIZE * radius,
+                image=photos[i] if photos else None,
                 wxyz=from_rotation_matrices(world_from_cam[:3, :3]).numpy(),
                 position=world_from_cam[:3, 3].numpy(),
             )
 
-    def look_from(self, eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> None:
-        """Sets the initial camera of browsers that connect."""
-        self._server.initial_camera.position = tuple(eye.tolist())
-        self._server.initial_camera.look_at = tuple(target.tolist())
+    def look_from(
+        self, eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Tensor | None = None, fov: float | None = None
+    ) -> None:
+        """Sets the initial camera of browsers that connect; `fov` is vertical, in radians."""
+        self._eye = eye.float()
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = tuple(eye.tolist()), tuple(target.tolist())
+        if up is not None:
+            camera.up = tuple(up.tolist())
+        if fov is not None:
+            camera.fov = fov
+        if self._gaussians is not None:
+            self.set_look()
+
+    def add_run(self, run: Path, scene: Scene | None, config: TrainConfig) -> tuple[RunControls, HeldOutViews | None]:
+        """Adds progress and stop of a run, and its held-out views."""
+        views = scene.test if scene else ()
+        return RunControls(self._server, run), held_out_views(self._server, views, config)
 
     def stop(self) -> None:
         self._server.stop()
@@ -150,11 +188,6 @@ def center_and_radius(means: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "3"], 
     return center, max(float(distances[int(0.9 * (len(distances) - 1))]), 1e-6)
 
 
-def input_cameras(run: Path) -> list[Cameras]:
-    """The input cameras of a run. Raises InputError when its dataset is gone."""
-    return [view.camera for view in load_scene(TrainConfig.read(run / "config.json").data).train]
-
-
 def view_file(viewer: SplatViewer, path: Path) -> None:
     """Show one splat file."""
     gaussians = load_splats(path)
@@ -166,39 +199,61 @@ def view_file(viewer: SplatViewer, path: Path) -> None:
 def view_run(viewer: SplatViewer, run: Path) -> Iterator[str]:
     """Shows a run and follows it without end; yields a line per update, or "" when nothing is new."""
     follower = RunFollower(run)
-    cameras, notice = cameras_or_notice(run)
+    config = TrainConfig.read(run / "config.json")
+    scene, notice = scene_or_notice(config)
     if notice:
         yield notice
+    controls, held_out = viewer.add_run(run, scene, config)
     framed = False
     while True:
         update = follower.poll()
+        controls.show(follower.share)
+        viewer.refresh()
         if update is not None and update.splats is not None:
             gaussians = load_splats(update.splats)
             if not framed:
-                frame_run(viewer, gaussians, cameras)
+                frame_run(viewer, gaussians, scene)
             framed = True
             viewer.show_splats(gaussians, update.caption)
+            if held_out is not None:
+                held_out.update(gaussians)
         yield update.caption if update else ""
 
 
-def cameras_or_notice(run: Path) -> tuple[list[Cameras], str]:
-    """(input cameras, ""), or ([], reason), so that a run can be viewed after its photos have moved."""
+def scene_or_notice(config: TrainConfig) -> tuple[Scene | None, str]:
+    """(scene, ""), or (None, reason), so that a run can be viewed after its photos have moved."""
     try:
-        return input_cameras(run), ""
+        return load_scene(config.data), ""
     except (InputError, UsageError) as error:
-        return [], f"no input cameras: {error}"
+        return None, f"no input cameras: {error}"
 
 
-def frame_run(viewer: SplatViewer, gaussians: Gaussians, cameras: list[Cameras]) -> None:
-    """Place the browser's camera, and the frusta where there are any."""
+def frame_run(viewer: SplatViewer, gaussians: Gaussians, scene: Scene | None) -> None:
+    """Opens the browser at the first input camera, its view filled by the splats; without cameras from aside."""
     center, radius = center_and_radius(gaussians.means)
-    eye = center + radius * torch.tensor([2.0, 2.0, 1.0])
-    if cameras:
-        viewer.show_cameras(cameras, radius)
-        # Behind and above the first camera, so that its own frustum does not cover the view.
-        first = cameras[0].centers[0].float()
-        eye = first + 0.25 * (first - center) + 0.25 * (first - center).norm() * mean_up(cameras).float()
-    viewer.look_from(eye, center)
+    if scene is None:
+        viewer.look_from(center + radius * torch.tensor([2.0, 2.0, 1.0]), center)
+        return
+    viewer.show_cameras([view.camera for view in scene.train], radius, [photo(view) for view in scene.train])
+    viewer.look_from(*home_view(gaussians, scene.train[0].camera, center))
+
+
+def home_view(
+    gaussians: Gaussians, camera: Cameras, center: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"], float]:
+    """(eye, target, up, vertical field of view) of the camera, turned and zoomed until the splats fill its image."""
+    lens = framed(gaussians, camera)
+    middle = torch.tensor([lens.width / 2, lens.height / 2, 1.0], dtype=torch.float64)
+    cam_from_world = camera.viewmats[0, :3, :3].double()
+    ray = cam_from_world.T @ torch.linalg.solve(lens.Ks[0].double(), middle)
+    eye = camera.centers[0].double()
+    distance = float((center.double() - eye) @ cam_from_world[2])
+    return eye, eye + ray * (distance if distance > 0 else 1.0), -cam_from_world[1], vertical_fov(lens)
+
+
+def photo(view: View) -> Any:
+    """[H, W, 3] a thumbnail of an input view on white."""
+    return np.asarray(shrunk(as_image(truth(view, torch.ones(3))), PHOTO_SIDE))
 
 
 def serve(target: Path, host: str, port: int, once: bool) -> None:
@@ -221,6 +276,7 @@ def serve(target: Path, host: str, port: int, once: bool) -> None:
         else:
             view_file(viewer, target)
             while not once:
+                viewer.refresh()
                 time.sleep(POLL_SECONDS)
     finally:
         viewer.stop()

@@ -11,19 +11,23 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 import torch
+from finished_runs import make_run, splats
 from PIL import Image
 
 from gsopt import cli
 from gsopt.config.train import DataConfig, TrainConfig
+from gsopt.data.scene import load_scene
 from gsopt.errors import InputError, MissingDependency
 from gsopt.events import EventWriter, to_json
 from gsopt.formats import save_splats
 from gsopt.gaussians import Gaussians
+from gsopt.geometry import sh
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 from gsopt.geometry.quats import rotation_matrices
-from gsopt.results import viewer
+from gsopt.results import run_follower, viewer, viewer_controls
 
 SIZE = 16
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -80,7 +84,7 @@ def preview(run: Path, step: int) -> dict[str, Any]:
 
 
 def test_a_follower_passes_over_previews_that_are_no_longer_the_newest(run: Path) -> None:
-    follower = viewer.RunFollower(run)
+    follower = run_follower.RunFollower(run)
     assert follower.poll() is None
     emit(run, {"kind": "started"}, preview(run, 1), preview(run, 2), {"kind": "progress", "step": 3})
     update = follower.poll()
@@ -93,14 +97,14 @@ def test_a_follower_passes_over_previews_that_are_no_longer_the_newest(run: Path
 def test_a_run_that_ended_shows_its_result(run: Path, last: str) -> None:
     save_splats(run / "splat.ply", gaussians())
     emit(run, preview(run, 1), {"kind": last})
-    update = viewer.RunFollower(run).poll()
-    assert update == viewer.Update((run / "splat.ply").resolve(), last)
+    update = run_follower.RunFollower(run).poll()
+    assert update == run_follower.Update((run / "splat.ply").resolve(), last)
 
 
 def test_a_run_that_ended_without_a_result_keeps_the_last_preview(run: Path) -> None:
     emit(run, preview(run, 1), {"kind": "error"})
-    update = viewer.RunFollower(run).poll()
-    assert update == viewer.Update((run / "previews/step_000001.ply").resolve(), "error")
+    update = run_follower.RunFollower(run).poll()
+    assert update == run_follower.Update((run / "previews/step_000001.ply").resolve(), "error")
 
 
 NO_PATHS = ["../outside.ply", "/etc/hostname", None, 7, "previews", "previews/absent.ply"]
@@ -112,14 +116,14 @@ def test_a_path_that_leads_out_of_the_run_or_nowhere_is_ignored(run: Path, path:
     save_splats(run.parent / "outside.ply", gaussians())
     (run / "circle").symlink_to("circle")
     emit(run, {"kind": "preview", "step": 1, "path": path})
-    update = viewer.RunFollower(run).poll()
+    update = run_follower.RunFollower(run).poll()
     assert update is None or update.splats is None
 
 
 @pytest.mark.parametrize("step", [None, "{alert(1)}", "![](http://evil.example)", [[1]], True, 1.5])
 def test_a_caption_holds_no_text_of_the_events(run: Path, step: object) -> None:
     emit(run, {**preview(run, 1), "step": step})
-    update = viewer.RunFollower(run).poll()
+    update = run_follower.RunFollower(run).poll()
     assert update is not None
     assert update.caption == "preview"
 
@@ -233,3 +237,106 @@ def test_view_once_serves_a_run_and_a_file(run: Path, capsys: pytest.CaptureFixt
     assert "http://127.0.0.1:" in out
     assert "step 3" in out
     assert cli.main(["view", str(run / "previews/step_000003.ply"), "--port", "0", "--once"]) == 0
+
+
+def test_the_opening_view_is_an_input_camera_filled_by_the_splats(recorder: Recorder, run: Path) -> None:
+    """Solid splats near the origin: their extreme pixels under the opening camera span most of its height or width."""
+    model = gaussians(200)
+    model.means[:] *= 0.15
+    model.logit_opacities[:] = 3
+    shown = viewer.SplatViewer("127.0.0.1", 0)
+    viewer.frame_run(shown, model, load_scene(TrainConfig.read(run / "config.json").data))
+    camera = recorder.server.initial_camera
+    eye, target, up = (torch.tensor(v, dtype=torch.float64) for v in (camera.position, camera.look_at, camera.up))
+    torch.testing.assert_close(eye.float(), EYES[0].float())
+    t = (model.means.double() - eye) @ look_at(eye[None], target, up)[0, :3, :3].T
+    height = (t[:, 1] / t[:, 2]).abs().max() / math.tan(camera.fov / 2)
+    width = (t[:, 0] / t[:, 2]).abs().max() / math.tan(camera.fov / 2) / 2
+    assert 0.75 < float(max(height, width)) < 1.1
+
+
+def test_the_size_slider_shrinks_splats_to_points_and_the_degree_slider_changes_colors(recorder: Recorder) -> None:
+    model = Gaussians(**{**dict(gaussians().items()), "shN": torch.rand(5, 15, 3, generator=torch.manual_seed(1))})
+    shown = viewer.SplatViewer("127.0.0.1", 0)
+    shown.look_from(torch.tensor([3.0, 0, 0]), torch.zeros(3))
+    shown.show_splats(model, "caption")
+    (splats,) = recorder.told("add_gaussian_splats")
+    handle = recorder.server.scene.add_gaussian_splats.return_value
+    shown.set_look(scale=0.5)
+    assert handle.covariances == pytest.approx(splats.covariances / 4)
+    shown.set_look(scale=0.0)
+    assert not handle.covariances.any()
+    shown.set_look(degree=0)
+    assert handle.rgbs == pytest.approx((model.sh0[:, 0] * 0.28209479 + 0.5).clamp(0, 1).numpy(), abs=1e-6)
+    shown.set_look(degree=3)
+    assert handle.rgbs == pytest.approx(splats.rgbs)
+
+
+def test_colors_follow_the_eye_of_the_visitor(recorder: Recorder) -> None:
+    model = Gaussians(**{**dict(gaussians().items()), "shN": torch.rand(5, 3, 3, generator=torch.manual_seed(1))})
+    shown = viewer.SplatViewer("127.0.0.1", 0)
+    shown.look_from(torch.tensor([3.0, 0, 0]), torch.zeros(3))
+    shown.show_splats(model, "caption")
+    handle = recorder.server.scene.add_gaussian_splats.return_value
+    handle.rgbs = "old"
+    shown._follow_eye(SimpleNamespace(position=(3.0, 0.001, 0)))
+    shown.refresh()
+    assert handle.rgbs == "old"  # hardly moved
+    shown._follow_eye(SimpleNamespace(position=(0.0, 3.0, 0)))
+    shown.refresh()
+    direction = torch.nn.functional.normalize(model.means - torch.tensor([0.0, 3, 0]), dim=1)
+    expected = sh.evaluate(model.sh0, model.shN, direction, 1).clamp(0, 1)
+    torch.testing.assert_close(torch.from_numpy(handle.rgbs), expected)
+
+
+def test_cameras_carry_their_photos(recorder: Recorder, run: Path) -> None:
+    emit(run, preview(run, 1))
+    next(viewer.view_run(viewer.SplatViewer("127.0.0.1", 0), run))
+    for frustum in recorder.told("add_camera_frustum"):
+        assert frustum.image.shape == (SIZE, 2 * SIZE, 3)
+        assert frustum.image[0, 0].tolist() == [200, 100, 50]
+
+
+def test_progress_is_shown_and_the_button_asks_the_run_to_stop(run: Path, recorder: Recorder) -> None:
+    gui = recorder.server.gui
+    bar, button = gui.add_progress_bar.return_value, gui.add_button.return_value
+    lines = viewer.view_run(viewer.SplatViewer("127.0.0.1", 0), run)
+    next(lines)
+    assert not bar.visible
+    emit(run, {"kind": "progress", "step": 30, "total": 120})
+    next(lines)
+    assert (bar.visible, button.visible, bar.value) == (True, True, 25.0)
+    button.on_click.call_args.args[0](None)
+    assert (run / "stop").read_bytes() == b""
+    emit(run, {"kind": "stopped", "step": 31})
+    next(lines)
+    assert (bar.visible, button.visible) == (False, False)
+
+
+@pytest.mark.parametrize("event", [{"step": "1", "total": 2}, {"step": True, "total": 2}, {"step": 1, "total": 0}, {}])
+def test_progress_that_makes_no_sense_is_no_progress(run: Path, event: dict[str, Any]) -> None:
+    emit(run, {"kind": "progress", **event})
+    follower = run_follower.RunFollower(run)
+    follower.poll()
+    assert follower.share is None
+
+
+def test_a_link_in_the_place_of_the_stop_file_is_not_followed(run: Path) -> None:
+    (run / "stop").symlink_to(run.parent / "dear")
+    viewer_controls.ask_to_stop(run)
+    assert (run / "stop").is_file()
+    assert not (run.parent / "dear").exists()
+
+
+def test_a_held_out_view_stands_beside_its_render_and_error(recorder: Recorder, tmp_path: Path) -> None:
+    """Splats that made the view: truth and render agree, the error is dark; none at all: it is not."""
+    made = make_run(tmp_path, test=2)
+    config = TrainConfig.read(made / "config.json")
+    views = load_scene(config.data).test
+    panel = viewer_controls.held_out_views(recorder.server, views, config)
+    assert panel is not None
+    right, nothing = (panel.panes(model) for model in (splats(), splats().select(torch.zeros(0, dtype=torch.int64))))
+    truth, render, error = np.split(right, 3, axis=1)
+    assert np.abs(truth.astype(int) - render).mean() < 6
+    assert error.mean() < np.split(nothing, 3, axis=1)[2].mean()
+    assert viewer_controls.held_out_views(recorder.server, (), config) is None

@@ -22,7 +22,7 @@ PATH_POSES, PATH_SECONDS = 72, 20.0
 CAMERA_SIZE = 0.06
 """Length of a drawn camera as a fraction of its distance to the focus."""
 DEFAULT_SIZE = 800
-FILLED, MAX_ZOOM, OUTSIDE = 0.92, 3.0, 0.01
+FILLED, MAX_ZOOM, OUTSIDE = 0.92, 3.0, 0.002
 """Share of the opening image that the splats fill; most it is magnified; share of splats left out on each side."""
 DIGITS = 7
 """Significant digits of a number in the page: float32 has as many."""

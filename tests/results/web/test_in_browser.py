@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from browser import Tab, tab
+from browser import PATIENCE, Tab, tab
 from finished_runs import WIDTH, make_run, splats
 
 from gsopt.cli import main
 from gsopt.data.scene import load_scene
+from gsopt.events import EventWriter
 from gsopt.gaussians import Gaussians
 from gsopt.results.finished_run import open_run
 from gsopt.results.web import save_run_page
@@ -120,3 +122,30 @@ def test_a_hostile_name_stays_a_name(browser: Tab, tmp_path: Path) -> None:
     assert main(["export", str(run), "-o", str(tmp_path / "a.html")]) == 0
     shown(browser, tmp_path / "a.html", "")
     assert browser.value("window.hacked === undefined && document.images.length") == 0
+
+
+def test_gsopt_view_opens_with_splats_that_fill_the_window(browser: Tab, run: Path) -> None:
+    pytest.importorskip("viser")
+    from gsopt.results import viewer
+
+    shown = viewer.SplatViewer("127.0.0.1", 0)
+    try:
+        emit_done(run)
+        next(viewer.view_run(shown, run))
+        browser.open(f"http://127.0.0.1:{shown.port}", 640, 480)
+        browser.wait_for("document.querySelector('canvas') !== null")
+        end = time.monotonic() + PATIENCE
+        while (inside := (browser.screenshot()[:, :440] < 240).any(axis=2)).mean() < 0.2:
+            assert time.monotonic() < end, inside.mean()
+            time.sleep(0.5)
+        rows = np.flatnonzero(inside.mean(axis=1) > 0.05)
+        assert rows[-1] - rows[0] > 0.6 * 480
+    finally:
+        shown.stop()
+
+
+def emit_done(run: Path) -> None:
+    writer = EventWriter(run)
+    writer.emit("started", total=100)
+    writer.emit("done", step=100)
+    writer.close()
