@@ -22,6 +22,9 @@
 #include <vector>
 
 #include "frame.h"
+#if defined(GSOPT_HAVE_AVX2)
+#include "processor.h"
+#endif
 
 namespace nb = nanobind;
 
@@ -46,12 +49,10 @@ using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 std::vector<const Kernels*> available_kernels() {
   std::vector<const Kernels*> found;
 #if defined(GSOPT_HAVE_AVX512)
-  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
-      __builtin_cpu_supports("avx512vl"))
-    found.push_back(&avx512::kernels);
+  if (has_avx512()) found.push_back(&avx512::kernels);
 #endif
 #if defined(GSOPT_HAVE_AVX2)
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
+  if (has_avx2()) {
     found.push_back(&avx2::kernels);
     found.push_back(&avx2x2::kernels);
   }

@@ -15,10 +15,10 @@ namespace gsopt::GSOPT_ISA {
 using f4 = float __attribute__((vector_size(16)));
 using f8 = float __attribute__((vector_size(32)));
 using i8 = int32_t __attribute__((vector_size(32)));
-// Unaligned views of the same, for loads and stores.
-using f4u = float __attribute__((vector_size(16), aligned(4), may_alias));
-using f8u = float __attribute__((vector_size(32), aligned(4), may_alias));
-using i8u = int32_t __attribute__((vector_size(32), aligned(4), may_alias));
+// Unaligned views of the same, for loads and stores. clang lowers the alignment of a typedef only, not of an alias.
+typedef float f4u __attribute__((vector_size(16), aligned(4), may_alias));
+typedef float f8u __attribute__((vector_size(32), aligned(4), may_alias));
+typedef int32_t i8u __attribute__((vector_size(32), aligned(4), may_alias));
 
 constexpr int kLanes = 8;
 // Times `sqrt_near` it is no less than `sqrt`: processors promise 1.5 / 2^12 for rsqrt, the products round.
@@ -99,8 +99,8 @@ inline i8 shift_exponent(i8 n) { return n << 23; }
 #if defined(GSOPT_SIXTEEN)
 using f16 = float __attribute__((vector_size(64)));
 using i16 = int32_t __attribute__((vector_size(64)));
-using f16u = float __attribute__((vector_size(64), aligned(4), may_alias));
-using i16u = int32_t __attribute__((vector_size(64), aligned(4), may_alias));
+typedef float f16u __attribute__((vector_size(64), aligned(4), may_alias));
+typedef int32_t i16u __attribute__((vector_size(64), aligned(4), may_alias));
 template <> inline f16 splat<f16>(float x) { return f16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
 inline i16 splat16i(int32_t x) { return i16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
 inline i16 bits(f16 v) { return (i16)v; }
