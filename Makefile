@@ -50,7 +50,7 @@ every-write: $(VENV)/.for-test
 # The tests that run kernels, on a build that stops at the first bad address or undefined behavior. -O1 halves the time to
 # compile; tests of the reference alone have no kernel to check. -S and -P: neither the editable install nor the sources are
 # imported instead of the build; --capture=sys leaves a sanitizer's report visible.
-KERNEL_TESTS := $(filter-out tests/raster/test_reference% tests/raster/test_device_compiles.py,$(wildcard tests/raster/test_*.py)) tests/init/stereo/test_matching.py
+KERNEL_TESTS := $(filter-out tests/raster/test_reference% tests/raster/test_device_compiles.py tests/raster/test_gpu_%,$(wildcard tests/raster/test_*.py)) tests/init/stereo/test_matching.py
 sanitize: $(VENV)/.for-test
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
 	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" -C cmake.define.GSOPT_OPTIMIZE=-O1 .

@@ -17,7 +17,6 @@ from gsopt.geometry.focus import find_focus
 from gsopt.init.frustum import random_points
 from gsopt.init.hull import hull_points
 from gsopt.init.points import gaussians_at
-from gsopt.init.stereo.points import stereo_points
 from gsopt.init.thumbnails import mean_colors, small_photos
 
 ENOUGH_POINTS = 100
@@ -93,6 +92,8 @@ def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Genera
 
 
 def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Generator) -> Start | None:
+    from gsopt.init.stereo.points import stereo_points  # its kernels are compiled, which the other ways do without
+
     found = stereo_points(scene, count, generator)
     if found.share < ENOUGH_AGREED:
         return None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool
@@ -55,13 +56,24 @@ class Truth:
 def deviation(backend: Backend, truth: Truth) -> Deviation:
     """Draw and differentiate the truth's scene with a float32 backend."""
     case = truth.case
-    single = case.gaussians.to(torch.float32)
+    single = case.gaussians.to(torch.float32).to(backend.device)
     frame = backend.forward(single, case.camera, case.settings, case.background, depth=True)
-    gradients = backend.backward(frame, *(weight.float() for weight in truth.weights), absgrad=True)
+    weights = (weight.float().to(backend.device) for weight in truth.weights)
+    gradients = here(backend.backward(frame, *weights, absgrad=True))
+    frame = here(frame)
     errors = gradient_errors(gradients, truth.gradients, case)
     worst = max(errors, key=lambda name: errors[name])
     undecided = 1 - float(truth.decided.double().mean())
     return Deviation(image_error(frame, truth.frame, truth.decided), errors[worst], worst, undecided)
+
+
+Record = TypeVar("Record", RenderedFrame, Gradients)
+
+
+def here(record: Record) -> Record:
+    """The same with its tensors on the CPU."""
+    tensors = {f.name: getattr(record, f.name) for f in fields(record)}
+    return replace(record, **{name: t.cpu() for name, t in tensors.items() if isinstance(t, Tensor)})
 
 
 def image_error(got: RenderedFrame, truth: RenderedFrame, decided: Tensor) -> float:
