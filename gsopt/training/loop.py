@@ -24,6 +24,7 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.raster.device.memory import PRIOR_BYTES, Memory
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
+from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.finite import require_finite, require_finite_loss
 from gsopt.training.guided.session import RunGuidance
 from gsopt.training.guided.start import start_guidance
@@ -36,8 +37,6 @@ from gsopt.training.trainer import Trainer
 PROGRESS_SECONDS = 0.5
 # Steps between two checks that every parameter is finite; the loss is checked in every step.
 FINITE_EVERY = 100
-# Photos up to which a run warns about what they leave open.
-MAX_FEW_PHOTOS = 3
 
 
 @dataclass(frozen=True)
@@ -232,28 +231,6 @@ def _start(
     for warning in scene.warnings + few_photo_warnings(scene):
         directory.warn(warning)
     return trainer, Clock(trainer.step, *spent)
-
-
-def few_photo_warnings(scene: Scene) -> tuple[str, ...]:
-    """Tells users of one to three photos what the photos leave open."""
-    if len(scene.train) > MAX_FEW_PHOTOS:
-        return ()
-    if not scene.has_alpha:
-        return (
-            f"{len(scene.train)} input views without masks: sides that they do not show cannot be completed. Add alpha "
-            "or a folder masks/ (docs/howto/photos.md), or more photos.",
-        )
-    if scene.completed and not scene.guessed:
-        return (
-            "One photo shows one side: the other sides are a guess. The silhouette is that of a thing which looks the "
-            "same from all around an upright axis, and that is assumed. A second photo from the side tells.",
-        )
-    if scene.guessed:
-        return (
-            "One photo shows one side: depth and the other sides are a guess, the silhouette inflated to a body in the "
-            "photo's colors. A second photo from the side helps most.",
-        )
-    return ()
 
 
 def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:

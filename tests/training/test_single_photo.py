@@ -15,7 +15,8 @@ from gsopt.events import read_events
 from gsopt.metrics import psnr
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
-from gsopt.training.loop import TrainResult, few_photo_warnings, train
+from gsopt.training.few_photos import few_photo_warnings
+from gsopt.training.loop import TrainResult, train
 from gsopt.training.plan import RunPlan
 
 BALL = [Ball((0.1, 0.0, 0.0), 0.6, (200, 60, 30)), Ball((-0.5, 0.2, 0.3), 0.25, (200, 60, 30))]
