@@ -7,8 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import bpy
+
 from .core import dataset, interpreter, job, prompts
 from .core.errors import GsoptError
+from .preferences import DEFAULTS, preferences
 
 
 def finish_dataset(scene: Any, work: job.Job) -> None:
@@ -44,11 +47,24 @@ def finish_doctor(scene: Any, work: job.Job) -> None:
         raise
 
 
+def finish_install(scene: Any, work: job.Job) -> None:
+    """The interpreter of the new environment becomes that of the preferences."""
+    python = Path(work.product)
+    if job.exit_code(work) not in (0, None) or not (python.parent / interpreter.console_script()).is_file():
+        raise GsoptError(job.complaint(work))
+    machine = preferences(bpy.context)
+    if machine is not DEFAULTS:
+        machine.interpreter = str(python)
+        bpy.context.preferences.is_dirty = True
+    scene.gsopt.doctor = f"gsopt is installed: {python}"
+
+
 FINISH: dict[str, Callable[[Any, job.Job], None]] = {
     "dataset": finish_dataset,
     "poses": finish_poses,
     "prompts": finish_prompts,
     "doctor": finish_doctor,
+    "install": finish_install,
 }
 
 

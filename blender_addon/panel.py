@@ -38,6 +38,8 @@ class GSOPT_PT_main(Sidebar, bpy.types.Panel):
         if settings.message:
             tell(layout.box(), settings.message, "ERROR")
         values(layout, settings, "folder")
+        if not show_job(layout, settings.job_install, "install"):
+            layout.operator("gsopt.install", icon="IMPORT")
         layout.operator("gsopt.allow_interpreter", icon="LOCKED")
         layout.operator("gsopt.test", text="Test Interpreter", icon="CHECKMARK")
         if settings.doctor:

@@ -14,7 +14,7 @@ from bpy.props import CollectionProperty, StringProperty
 from .core import interpreter
 from .properties import GsoptPath
 
-DEFAULTS = SimpleNamespace(interpreter="", checkout="", folder="", llm="", model="", allowed=())
+DEFAULTS = SimpleNamespace(interpreter="", package="gsopt[sfm]", checkout="", folder="", llm="", model="", allowed=())
 
 
 class GsoptPreferences(bpy.types.AddonPreferences):
@@ -29,6 +29,11 @@ class GsoptPreferences(bpy.types.AddonPreferences):
     )
     allowed: CollectionProperty(type=GsoptPath)  # type: ignore[valid-type]
     """Interpreters that were found and that the user has allowed to run, by their real paths."""
+    package: StringProperty(  # type: ignore[valid-type]
+        name="Package",
+        description="What Install gsopt installs: a name on the package index, or the path of a wheel",
+        default=DEFAULTS.package,
+    )
     checkout: StringProperty(  # type: ignore[valid-type]
         name="Source Folder",
         description="Folder of gsopt's sources with scripts/synth_views.py; empty: found above the interpreter",
@@ -48,12 +53,13 @@ class GsoptPreferences(bpy.types.AddonPreferences):
     def draw(self, context: Any) -> None:
         layout = self.layout
         layout.use_property_split = True
-        for name in ("interpreter", "checkout", "folder", "llm", "model"):
+        for name in ("interpreter", "package", "checkout", "folder", "llm", "model"):
             layout.prop(self, name)
         for entry in self.allowed:
             layout.label(text=f"Allowed: {entry.path}", icon="CHECKMARK")
         row = layout.row(align=True)
         row.operator("gsopt.test", icon="CHECKMARK")
+        row.operator("gsopt.install", icon="IMPORT")
         row.operator("gsopt.allow_interpreter", icon="LOCKED")
         row.operator("gsopt.forget_interpreters", icon="X")
         for line in textwrap.wrap(context.scene.gsopt.doctor, 90):

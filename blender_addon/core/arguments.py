@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,6 +107,11 @@ def prompts(python: Path, writing: Writing, out: Path) -> list[str]:
     words += ["-n", str(writing.count), "--llm", writing.llm or "none", "-o", str(out)]
     words += [f"--model={writing.model}"] if writing.model else []
     return words + (["--images", *map(str, writing.images)] if writing.images else [])
+
+
+def install(folder: Path, package: str) -> list[str]:
+    """`core/install_gsopt.py`, run by Blender's own Python."""
+    return [sys.executable, str(Path(__file__).with_name("install_gsopt.py")), str(folder), package]
 
 
 def doctor(python: Path) -> list[str]:
