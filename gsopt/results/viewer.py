@@ -27,6 +27,7 @@ from gsopt.raster.reference import covariances
 from gsopt.results.finished_run import truth
 from gsopt.results.report.embedded_images import shrunk
 from gsopt.results.run_follower import RunFollower
+from gsopt.results.unseen import marked, unseen
 from gsopt.results.video import as_image
 from gsopt.results.viewer_controls import HeldOutViews, RunControls, held_out_views
 from gsopt.results.viewer_server import start_server
@@ -56,7 +57,9 @@ class SplatViewer:
         self._lock = threading.Lock()
         self._gaussians: Gaussians | None = None
         self._splats: Any = None
-        self._scale, self._degree = 1.0, MAX_SH_DEGREE
+        self._scale, self._degree, self._mark = 1.0, MAX_SH_DEGREE, False
+        self._cameras: list[Cameras] = []
+        self._unseen: Tensor | None = None
         self._eye = self._seen_from = torch.zeros(3)
         self._add_look_controls()
         self._server.on_client_connect(lambda client: client.camera.on_update(self._follow_eye))
@@ -67,6 +70,8 @@ class SplatViewer:
         scale.on_update(lambda _: self.set_look(scale=float(scale.value)))
         degree = gui.add_slider("SH degree", min=0, max=MAX_SH_DEGREE, step=1, initial_value=MAX_SH_DEGREE)
         degree.on_update(lambda _: self.set_look(degree=int(degree.value)))
+        mark = gui.add_checkbox("mark what no photo shows", initial_value=False)
+        mark.on_update(lambda _: self.set_look(mark=bool(mark.value)))
         color = gui.add_rgb("background", initial_value=(255, 255, 255))
         color.on_update(lambda _: self.set_background(color.value))
 
@@ -74,10 +79,11 @@ class SplatViewer:
         """Fills the space behind the splats with one color, 0 to 255."""
         self._server.scene.set_background_image(np.full((2, 2, 3), color, np.uint8))
 
-    def set_look(self, scale: float | None = None, degree: int | None = None) -> None:
-        """Draws the splats smaller, to points at 0, or with fewer bands of their harmonics."""
+    def set_look(self, scale: float | None = None, degree: int | None = None, mark: bool | None = None) -> None:
+        """Draws the splats smaller, to points at 0, with fewer bands of their harmonics, or the unseen ones marked."""
         self._scale = self._scale if scale is None else scale
         self._degree = self._degree if degree is None else degree
+        self._mark = self._mark if mark is None else mark
         with self._lock:
             if self._gaussians is not None:
                 self._splats.covariances = self._covariances()
@@ -105,7 +111,11 @@ class SplatViewer:
         assert self._gaussians is not None
         g, self._seen_from = self._gaussians, self._eye
         directions = torch.nn.functional.normalize(g.means - self._eye, dim=1)
-        return sh.evaluate(g.sh0, g.shN, directions, min(self._degree, g.sh_degree)).clamp(0, 1).numpy()
+        rgb = sh.evaluate(g.sh0, g.shN, directions, min(self._degree, g.sh_degree)).clamp(0, 1)
+        if self._mark and self._cameras:
+            self._unseen = unseen(g, self._cameras) if self._unseen is None else self._unseen
+            rgb = marked(rgb, self._unseen)
+        return rgb.numpy()
 
     @property
     def port(self) -> int:
@@ -116,7 +126,7 @@ class SplatViewer:
     def show_splats(self, gaussians: Gaussians, caption: str) -> None:
         """Replaces the splats. The browser's renderer knows no harmonics: colors are those seen from one eye."""
         with self._lock:
-            self._gaussians = gaussians
+            self._gaussians, self._unseen = gaussians, None
             self._splats = self._server.scene.add_gaussian_splats(
                 "/splats",
                 centers=gaussians.means.numpy(),
@@ -131,6 +141,7 @@ class SplatViewer:
 
         `radius` of the scene sets their size.
         """
+        self._cameras, self._unseen = cameras, None
         self._server.scene.set_up_direction(tuple(mean_up(cameras).tolist()))
         for i, camera in enumerate(cameras):
             world_from_cam = torch.linalg.inv(camera.viewmats[0].double())

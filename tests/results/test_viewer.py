@@ -272,6 +272,20 @@ def test_the_size_slider_shrinks_splats_to_points_and_the_degree_slider_changes_
     assert handle.rgbs == pytest.approx(splats.rgbs)
 
 
+def test_what_no_photo_shows_is_marked_while_the_box_is_ticked(recorder: Recorder) -> None:
+    shown, model = viewer.SplatViewer("127.0.0.1", 0), gaussians(40)
+    shown.show_cameras(cameras()[:1], radius=1.0)
+    shown.show_splats(model, "caption")
+    (splats,) = recorder.told("add_gaussian_splats")
+    handle = recorder.server.scene.add_gaussian_splats.return_value
+    shown.set_look(mark=True)
+    hidden = viewer.unseen(model, cameras()[:1]).numpy()
+    assert 0 < hidden.sum() < 40
+    assert ((handle.rgbs != splats.rgbs).any(axis=1) == hidden).all()
+    shown.set_look(mark=False)
+    assert (handle.rgbs == splats.rgbs).all()
+
+
 def test_colors_follow_the_eye_of_the_visitor(recorder: Recorder) -> None:
     model = Gaussians(**{**dict(gaussians().items()), "shN": torch.rand(5, 3, 3, generator=torch.manual_seed(1))})
     shown = viewer.SplatViewer("127.0.0.1", 0)

@@ -1,0 +1,41 @@
+"""What no input view shows is marked, and nothing else."""
+
+from __future__ import annotations
+
+import torch
+
+from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras, intrinsics, look_at
+from gsopt.results.unseen import MARK, marked, unseen
+
+
+def balls(centers: list[tuple[float, float, float]]) -> Gaussians:
+    count = len(centers)
+    return Gaussians(
+        means=torch.tensor(centers),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        log_scales=torch.full((count, 3), -2.0),
+        logit_opacities=torch.full((count,), 8.0),
+        sh0=torch.zeros(count, 1, 3),
+        shN=torch.zeros(count, 0, 3),
+    )
+
+
+def camera(x: float) -> Cameras:
+    eye, up = torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64), torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    return Cameras(look_at(eye, torch.zeros(3, dtype=torch.float64), up), intrinsics(0.8, 64, 64)[None], 64, 64)
+
+
+def test_what_another_hides_or_the_frame_leaves_out_is_unseen() -> None:
+    front, back, beside = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 9.0, 0.0)
+    model = balls([front, back, beside])
+    assert unseen(model, [camera(4.0)]).tolist() == [False, True, True]
+    assert unseen(model, [camera(-4.0)]).tolist() == [True, False, True]
+    assert unseen(model, [camera(4.0), camera(-4.0)]).tolist() == [False, False, True]
+
+
+def test_only_hidden_colors_are_mixed_with_the_mark() -> None:
+    rgb = torch.tensor([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    mixed = marked(rgb, torch.tensor([False, True]))
+    assert torch.equal(mixed[0], rgb[0])
+    assert float((mixed[1] - MARK).norm()) < float((rgb[1] - MARK).norm()) / 2
