@@ -27,6 +27,11 @@ def finish_poses(scene: Any, work: job.Job) -> None:
     scene.gsopt.dataset, scene.gsopt.source = work.product, "DATASET"
 
 
+def finish_masks(scene: Any, work: job.Job) -> None:
+    if not (Path(work.product) / "masks.json").is_file():
+        raise GsoptError(job.complaint(work))
+
+
 def finish_prompts(scene: Any, work: job.Job) -> None:
     if not Path(work.product).is_file():
         raise GsoptError(job.complaint(work))
@@ -62,6 +67,7 @@ def finish_install(scene: Any, work: job.Job) -> None:
 FINISH: dict[str, Callable[[Any, job.Job], None]] = {
     "dataset": finish_dataset,
     "poses": finish_poses,
+    "masks": finish_masks,
     "prompts": finish_prompts,
     "doctor": finish_doctor,
     "install": finish_install,

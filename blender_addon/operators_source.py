@@ -123,6 +123,25 @@ class GSOPT_OT_find_poses(WaitingOperator, bpy.types.Operator):
         return begin(context, self, job.start("poses", call, folder, out))
 
 
+class GSOPT_OT_cut_out(WaitingOperator, bpy.types.Operator):
+    """Cut the object out of the dataset's photos: `gsopt masks`"""
+
+    bl_idname = "gsopt.cut_out"
+    bl_label = "Cut Out Object"
+
+    def do(self, context: Any) -> str:
+        refuse_two(context, "masks")
+        settings = context.scene.gsopt
+        if not settings.dataset:
+            raise UsageError("No dataset is chosen. Choose one, or find the poses of photos.")
+        data = absolute(settings.dataset)
+        if (data / "masks").exists():
+            raise UsageError(f"{data} has masks already. Remove its folder masks to make them again.")
+        call = arguments.masks(python(context), data)
+        folder = job.free_folder(work_folder(context) / "jobs", "masks")
+        return begin(context, self, job.start("masks", call, folder, data / "masks"))
+
+
 class GSOPT_OT_cancel(ReportingOperator, bpy.types.Operator):
     """End this work"""
 
@@ -142,4 +161,4 @@ class GSOPT_OT_cancel(ReportingOperator, bpy.types.Operator):
         return "Canceled."
 
 
-CLASSES = (GSOPT_OT_test, GSOPT_OT_render_dataset, GSOPT_OT_find_poses, GSOPT_OT_cancel)
+CLASSES = (GSOPT_OT_test, GSOPT_OT_render_dataset, GSOPT_OT_find_poses, GSOPT_OT_cut_out, GSOPT_OT_cancel)

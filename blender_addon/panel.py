@@ -64,6 +64,8 @@ class GSOPT_PT_source(Child, bpy.types.Panel):
                 layout.operator("gsopt.find_poses", icon="CAMERA_DATA")
         else:
             values(layout, settings, "dataset")
+            if not show_job(layout, settings.job_masks, "masks"):
+                layout.operator("gsopt.cut_out", icon="MOD_MASK")
 
 
 class GSOPT_PT_guidance(Child, bpy.types.Panel):

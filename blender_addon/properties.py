@@ -134,6 +134,7 @@ class GsoptScene(bpy.types.PropertyGroup):
 
     job_dataset: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_poses: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
+    job_masks: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_prompts: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_doctor: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_install: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]

@@ -88,6 +88,11 @@ def poses(python: Path, photos: Path, out: Path, seed: int = 0, threads: int = 0
     return [*words, "--seed", str(seed), "--threads", str(threads)]
 
 
+def masks(python: Path, data: Path) -> list[str]:
+    """`gsopt masks` for the photos of a dataset: writes its folder masks/."""
+    return [str(python), "-m", "gsopt", "masks", str(data)]
+
+
 @dataclass(frozen=True)
 class Writing:
     """Options of `gsopt prompts`."""

@@ -14,6 +14,7 @@ from gsopt.errors import GsoptError, InputError, InputWarning, UsageError, refus
 
 VERBS = {
     "sfm": "find the poses of photos or a video",
+    "masks": "cut the object out of photos",
     "prompts": "turn an expert's words into the prompts that guide a reconstruction",
     "train": "learn Gaussians from posed images",
     "render": "draw a finished run as images or a video",

@@ -30,7 +30,8 @@ from gsopt.errors import SettingError, UsageError
 
 FLAGS = {
     "iterations": "--iterations N",
-    "data.masks": "--masks given|none|DIR",
+    "data.masks": "--masks given|auto|none|DIR",
+    "data.mask_model": "--mask-model FILE",
     "data.views": "--views N",
     "data.view_ids": "--view-ids I,J,...",
     "data.downscale": "--resolution -r",

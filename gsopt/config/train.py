@@ -48,8 +48,10 @@ class DataConfig:
     cache_mb: Count = 2048
     """Decoded images kept in memory, MB; the rest is read again when needed."""
     masks: str = "given"
-    """Masks of the object: given (alpha or the dataset's own folder), none (no mask files), or a folder with a mask
-    named like each image."""
+    """Masks of the object: given (alpha or the dataset's own folder), none (no mask files), a folder with a mask named
+    like each image, or auto: given ones, else made by a mask model (see gsopt masks)."""
+    mask_model: str | None = None
+    """ONNX file of the mask model for auto; by default $GSOPT_MASK_MODEL, else one that rembg has fetched."""
 
     @property
     def evaluation_background(self) -> tuple[float, float, float]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsopt.data import files
 from gsopt.data.posed_images import Dataset, PosedImage, summarize_names
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 
 FOLDER = "masks"
 """The folder of a dataset's own masks."""
@@ -26,6 +26,8 @@ def with_masks(dataset: Dataset, root: Path, choice: str = "given") -> Dataset:
     InputError for a folder that fits no image."""
     if choice == "none":
         return _masked(dataset, lambda frames: [None] * len(frames))
+    if choice == "auto":
+        raise UsageError("`--masks auto` is for `gsopt train` and reconstruct(), got it here. Run `gsopt masks` first.")
     if choice != "given":
         return _with_folder(dataset, Path(choice).expanduser())
     folder = root / FOLDER

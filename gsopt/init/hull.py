@@ -116,19 +116,27 @@ def in_hull(photos: list[Thumbnail], points: Float[Tensor, "N 3"], radius: float
     alive, here = torch.arange(len(points)), points
     shown = torch.zeros(len(points), dtype=torch.int32)
     for photo in photos:
-        column, row, depth = project(photo.camera, here)
-        visible = inside(photo.camera, column, row, depth)
-        alpha = _widened(photo, radius, depth[visible]) if radius else photo.alpha()
-        passed = ~visible
-        if photo.shows_all():
-            passed &= _near(photo.camera, column, row, depth, radius)
-        column, row = (torch.where(visible, coordinate, 0.0) for coordinate in (column, row))  # no NaN to sample at
-        rows = torch.nonzero((visible & (sample(alpha, column, row)[0] > _SOLID_ALPHA)) | passed)[:, 0]
+        admitted, visible = admits(photo, here, radius)
+        rows = torch.nonzero(admitted)[:, 0]
         alive, here = alive.index_select(0, rows), here.index_select(0, rows)
         shown = shown.index_select(0, rows) + visible.index_select(0, rows)
     kept = torch.zeros(len(points), dtype=torch.bool)
     kept[alive] = 2 * shown >= len(photos)
     return kept
+
+
+def admits(
+    photo: Thumbnail, points: Float[Tensor, "N 3"], radius: float = 0.0
+) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
+    """True for points that one photo does not carve away, and true for those within its image."""
+    column, row, depth = project(photo.camera, points)
+    visible = inside(photo.camera, column, row, depth)
+    alpha = _widened(photo, radius, depth[visible]) if radius else photo.alpha()
+    passed = ~visible
+    if photo.shows_all():
+        passed &= _near(photo.camera, column, row, depth, radius)
+    column, row = (torch.where(visible, coordinate, 0.0) for coordinate in (column, row))  # no NaN to sample at
+    return (visible & (sample(alpha, column, row)[0] > _SOLID_ALPHA)) | passed, visible
 
 
 def _near(camera: Cameras, column: Tensor, row: Tensor, depth: Tensor, radius: float) -> Bool[Tensor, "N"]:

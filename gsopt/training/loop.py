@@ -13,13 +13,14 @@ from pathlib import Path
 import torch
 
 from gsopt.config.train import TrainConfig
-from gsopt.data.scene import Scene, load_scene
+from gsopt.data.scene import Scene
 from gsopt.errors import InputError, NumericalError
 from gsopt.events import to_json, write_atomic
 from gsopt.formats.ply import save_ply
 from gsopt.gaussians import Gaussians
 from gsopt.init import first_gaussians
 from gsopt.init.guessed_views import with_guessed_views
+from gsopt.init.mask_repair import RepairedMask, load_with_agreeing_masks
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.raster.device.memory import PRIOR_BYTES, Memory
@@ -78,7 +79,7 @@ def train(
     with opened(Path(run), config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
         backend = make_backend(config.backend, config.threads, config.device)
         with one_torch_thread(), on_its_gpu(backend):
-            scene = load_scene(config.data)
+            scene, repaired = load_with_agreeing_masks(config.data)
             scene = with_recorded_mirrors(config, scene, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)
@@ -86,6 +87,7 @@ def train(
             guidance = start_guidance(config, plan, scene, backend, directory)
             require_memory(plan, scene, backend, guidance)
             trainer, clock = _start(plan, scene, backend, directory, guidance, began)
+            _report_masks(repaired, directory)
             stopped = _advance(trainer, directory, stop, clock)
             _finish(trainer, directory, clock)
             if guidance is not None:
@@ -231,6 +233,13 @@ def _start(
     for warning in scene.warnings + few_photo_warnings(scene):
         directory.warn(warning)
     return trainer, Clock(trainer.step, *spent)
+
+
+def _report_masks(repaired: list[RepairedMask], directory: RunDirectory) -> None:
+    """Records the masks that were repaired, and warns about each."""
+    directory.record(repaired_masks=[mask.to_dict() for mask in repaired])
+    for mask in repaired:
+        directory.warn(mask.about)
 
 
 def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock: Clock) -> bool:

@@ -14,6 +14,7 @@ from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import UsageError
 from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import Gaussians
+from gsopt.init.cut_out import with_made_masks
 from gsopt.metrics import find_vgg_weights
 from gsopt.results.evaluation import evaluate, read_metrics
 from gsopt.results.report import write_report
@@ -59,7 +60,7 @@ def reconstruct(
         refuse_another_run(run)
         require_guidance(config.guidance)
     find_vgg_weights()  # a variable that names no file is noticed now, not after the training
-    config = _with_poses(config, run, log)
+    config = _with_masks(_with_poses(config, run, log), run, log)
     with StopRequest(run / "stop") as stop:
         result = train(config, run, resume=resume, on_progress=on_progress, done=False)
         if result.stopped:
@@ -95,8 +96,18 @@ def _with_absolute_paths(config: TrainConfig) -> TrainConfig:
         tiny_vae=_absolute(config.guidance.tiny_vae),
         ref_image=tuple(map(_absolute, config.guidance.ref_image)),
     )
-    path = str(Path(config.data.path).expanduser().absolute())
-    return replace(config, data=replace(config.data, path=path), guidance=guidance)
+    data = replace(
+        config.data,
+        path=str(Path(config.data.path).expanduser().absolute()),
+        masks=_absolute_masks(config.data.masks),
+        mask_model=_absolute(config.data.mask_model) if config.data.mask_model else None,
+    )
+    return replace(config, data=data, guidance=guidance)
+
+
+def _absolute_masks(choice: str) -> str:
+    """A folder of masks as an absolute path; a word as it is."""
+    return choice if choice in ("given", "auto", "none") else _absolute(choice)
 
 
 def _absolute(name: str) -> str:
@@ -112,6 +123,13 @@ def _with_poses(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
         return config
     scene = posed_scene(data, run.absolute().parent, SfmConfig(seed=config.seed, threads=config.threads), log)
     return replace(config, data=replace(config.data, path=str(scene)))
+
+
+def _with_masks(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
+    """`--masks auto` becomes the dataset's own masks, or a folder beside the run with masks of a network."""
+    if config.data.masks != "auto":
+        return config
+    return replace(config, data=with_made_masks(config.data, run.absolute().parent, log))
 
 
 def _evaluated(

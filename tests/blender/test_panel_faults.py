@@ -144,6 +144,22 @@ def test_poses_are_found_or_the_reason_is_told(panel: Any, tmp_path: Path) -> No
     assert (Path(panel.dataset) / "transforms.json").is_file()
 
 
+def test_the_object_is_cut_out_or_the_reason_is_told(panel: Any, tmp_path: Path) -> None:
+    import bpy
+
+    panel.source = "DATASET"
+    panel.dataset = ""
+    fails_with("No dataset is chosen", bpy.ops.gsopt.cut_out)
+    (tmp_path / "data").mkdir()
+    panel.dataset = str(tmp_path / "data")
+    stand_in(tmp_path, "echo 'gsopt: Cutting out an object needs a mask model.'; exit 2")
+    fails_with("needs a mask model", bpy.ops.gsopt.cut_out)
+    stand_in(tmp_path, 'mkdir -p "$4/masks"; echo {} > "$4/masks/masks.json"')
+    bpy.ops.gsopt.cut_out()
+    assert panel.job_masks.state == "DONE"
+    fails_with("has masks already", bpy.ops.gsopt.cut_out)
+
+
 def test_a_downloaded_job_ends_in_a_message(panel: Any, tmp_path: Path) -> None:
     import bpy
 

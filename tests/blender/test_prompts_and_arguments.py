@@ -176,6 +176,18 @@ def test_gsopt_sfm_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert asked.value.args == (tmp_path, tmp_path / "a posed", 3, 1)
 
 
+def test_gsopt_masks_takes_the_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("tyro")
+    from gsopt.cli import masks
+    from gsopt.errors import MissingDependency
+
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    monkeypatch.delenv("GSOPT_MASK_MODEL", raising=False)
+    words = arguments.masks(Path("python"), tmp_path / "a dataset")
+    with pytest.raises(MissingDependency, match="mask model"):  # the flags were understood
+        masks.main(words[4:])
+
+
 def test_gsopt_prompts_takes_the_flags(tmp_path: Path) -> None:
     tyro = pytest.importorskip("tyro")
     from gsopt.cli.prompts.generate import Flags

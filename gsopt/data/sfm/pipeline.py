@@ -7,7 +7,6 @@ Nothing is left behind but the finished folder: all work happens under a hidden 
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,6 +34,7 @@ from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import extract_frames, is_video
 from gsopt.data.sfm.write_scene import write_scene
+from gsopt.data.working_folder import working_folder
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
 
@@ -65,7 +65,7 @@ def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lam
         raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
     pycolmap = require("pycolmap", "sfm", "Finding camera poses")
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # the diagnosis reports what matters
-    with _working_folder(out) as work:
+    with working_folder(out) as work:
         run = _Run(pycolmap, source, work, config, report)
         scene, found = run.posed()
         if out.is_dir():
@@ -227,17 +227,3 @@ def fingerprint(source: Path) -> list[list[Any]]:
     """Name, size and time of each input file: a scene with another fingerprint is out of date."""
     paths = [source] if is_video(source) else find_photos(source)
     return [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
-
-
-@contextmanager
-def _working_folder(out: Path) -> Iterator[Path]:
-    """A hidden folder beside `out`, gone afterwards whatever happens."""
-    work = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    try:
-        work.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"Cannot write beside {out}: {error.strerror or error}. Choose another `--out`.") from error
-    try:
-        yield work
-    finally:
-        shutil.rmtree(work, ignore_errors=True)

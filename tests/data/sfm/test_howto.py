@@ -11,12 +11,13 @@ from gsopt.data.sfm.settings import SfmConfig
 
 HOWTO = Path(__file__).parents[3] / "docs/howto/photos.md"
 SOURCES = Path(sfm.__file__).parent
-OTHER_VERBS = {"--refine-poses", "--lambda-sds", "--threads", "--out", "--seed"}
+OTHER_VERBS = {"--refine-poses", "--lambda-sds", "--threads", "--out", "--seed", "--model", "--mask-model"}
 
 
 def said() -> str:
-    """All sources with implicitly joined string literals joined, and photos' names taken out."""
-    text = "".join(path.read_text(encoding="utf-8") for path in sorted(SOURCES.glob("*.py")))
+    """All sources that read photos, with implicitly joined string literals joined and photos' names taken out."""
+    folders = (SOURCES, SOURCES.parent, SOURCES.parents[1] / "init")
+    text = "".join(path.read_text(encoding="utf-8") for folder in folders for path in sorted(folder.glob("*.py")))
     return re.sub(r'"\n\s+f?"', "", text).replace("{twin.name}", "room_00.jpg")
 
 
