@@ -75,6 +75,7 @@ def test_numbers_that_python_and_kernels_share_are_the_same() -> None:
     assert told("kThreads") == runtime.THREADS
     assert told("kTile") == frame.TILE
     assert told("kBandGroup") == device_backend.BAND_GROUP
+    assert f"AdamTensor of[{device_backend.MOST_TENSORS}];" in text
     assert told("kViewMargin") == pytest.approx(camera.VIEW_MARGIN)
     fields_of_sums = re.search(r"enum RowField \{([^}]*), kRowFields \}", text)
     assert fields_of_sums

@@ -4,19 +4,29 @@
 
 namespace gsopt::GSOPT_ISA {
 
-struct AdamArguments {
-  Index count;  // of numbers
-  AdamRates rates;
+// One tensor of the Gaussians: the blocks from `first_block` on step its numbers.
+struct AdamTensor {
+  Index count;
+  int first_block;
   float step_size, inverse_root;
   const float* gradient;
   float *param, *exp_avg, *exp_avg_sq;
 };
 
+struct AdamArguments {
+  AdamRates rates;
+  int tensors;  // the others are not read
+  AdamTensor of[6];
+};
+
 KERNEL(adam, AdamArguments) {
+  int k = 0;
+  while (k + 1 < a.tensors && a.of[k + 1].first_block <= block()) ++k;
   PHASE(t) {
-    const Index i = static_cast<Index>(block()) * kThreads + t;
-    if (i < a.count)
-      adam_number(a.rates, a.step_size, a.inverse_root, a.gradient[i], a.param[i], a.exp_avg[i], a.exp_avg_sq[i]);
+    const AdamTensor& of = a.of[k];
+    const Index i = static_cast<Index>(block() - of.first_block) * kThreads + t;
+    if (i < of.count)
+      adam_number(a.rates, of.step_size, of.inverse_root, of.gradient[i], of.param[i], of.exp_avg[i], of.exp_avg_sq[i]);
   }
 }
 

@@ -20,6 +20,8 @@ from gsopt.raster.device.runtime import THREADS, Runtime
 from gsopt.raster.device.source import program
 from gsopt.raster.tensors import as_float32, contiguous, overwritable
 
+MOST_TENSORS = 6
+"""Parameters of a Gaussian, which one launch of `adam` steps."""
 BAND_GROUP = 64
 """Gaussians of a block of `adam_bands`: `kBandGroup` in adam.h."""
 
@@ -35,6 +37,8 @@ class DeviceBackend:
         parts = members(self._records["project_gaussians"])
         self._parameters = parts["P"]
         self._views = Views(parts["camera"])
+        stepped = members(self._records["adam"])
+        self._adam_rates, self._adam_tensor = stepped["rates"], stepped["of"]._type_
 
     def forward(
         self,
@@ -140,26 +144,19 @@ class DeviceBackend:
         settings: RasterSettings,
     ) -> None:
         """See `Backend.adam`. All tensors must be float32, contiguous and on the device."""
-        # The bands first, while the means are those that were drawn.
+        rates = filled(self._adam_rates, vars(step))
+        tensors, blocks = [], 0
         for name in sorted(step.lr, key=lambda name: name != "shN"):
-            record: dict[str, Any] = {
-                "param": getattr(gaussians, name),
-                "exp_avg": getattr(exp_avg, name),
-                "exp_avg_sq": getattr(exp_avg_sq, name),
-            }
-            _require_dense(record, name)
-            t = step.steps[name]
-            rates: dict[str, Any] = {
-                "rates": filled(members(self._records["adam"])["rates"], vars(step)),
-                "step_size": step.lr[name] / (1 - step.beta1**t),
-                "inverse_root": 1 / math.sqrt(1 - step.beta2**t),
-            }
+            record = _stepped(name, gaussians, exp_avg, exp_avg_sq, step)
             gradient = getattr(gradients, name)
-            if gradient is None:
-                self._adam_bands(gaussians, gradients, camera, settings, {**record, **rates})
-            else:
-                size = gradient.numel()
-                self._launch("adam", size, count=size, gradient=gradient, **record, **rates)
+            if gradient is None:  # the first, while the means are those that were drawn
+                self._adam_bands(gaussians, gradients, camera, settings, {**record, "rates": rates})
+                continue
+            tensors.append({**record, "gradient": gradient, "count": gradient.numel(), "first_block": blocks})
+            blocks += -(-gradient.numel() // THREADS)
+        unused = [self._adam_tensor()] * (MOST_TENSORS - len(tensors))
+        filled_in = [filled(self._adam_tensor, _addresses(tensor)) for tensor in tensors]
+        self._launch("adam", blocks * THREADS, rates=rates, tensors=len(tensors), of=filled_in + unused)
 
     def _adam_bands(
         self,
@@ -224,8 +221,8 @@ class DeviceBackend:
         """Start a kernel of so many threads; tensors are handed on as pointers, which must live until then."""
         if threads == 0:
             return
-        values = {k: v.data_ptr() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-        self.runtime.launch(kernel, -(-threads // THREADS), filled(self._records[kernel], values))
+        record = filled(self._records[kernel], _addresses(arguments))
+        self.runtime.launch(kernel, -(-threads // THREADS), record)
 
     def _require_here(self, gaussians: Gaussians) -> None:
         if gaussians.means.device != self.device:
@@ -253,7 +250,20 @@ def _lists(splats: Splats, entries: Entries, size: tuple[int, int], behind: tupl
     }
 
 
-def _require_dense(record: dict[str, Tensor], name: str) -> None:
-    for tensor in record.values():
+def _addresses(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The same with the addresses of tensors."""
+    return {name: value.data_ptr() if isinstance(value, Tensor) else value for name, value in arguments.items()}
+
+
+def _stepped(
+    name: str, gaussians: Gaussians, exp_avg: Gaussians, exp_avg_sq: Gaussians, step: AdamStep
+) -> dict[str, Any]:
+    """A parameter, its moments, and its rate over the bias corrections. Raises UsageError for what would be copied."""
+    records = {"param": gaussians, "exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}
+    tensors = {kind: getattr(record, name) for kind, record in records.items()}
+    for tensor in tensors.values():
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
             raise UsageError(f"`{name}` must be contiguous float32 here, got {tensor.dtype}. Convert it first.")
+    t = step.steps[name]
+    rate = step.lr[name] / (1 - step.beta1**t)
+    return {**tensors, "step_size": rate, "inverse_root": 1 / math.sqrt(1 - step.beta2**t)}

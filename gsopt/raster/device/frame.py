@@ -90,8 +90,10 @@ class Entries:
             long_tiles=None if short else where,
         )
         where, slots = torch.sort(where, stable=True)
-        bounds = torch.arange(tiles + 1, dtype=where.dtype, device=device)
-        begin = torch.searchsorted(where, bounds, out_int32=True)
+        begin = torch.zeros(tiles + 1, dtype=torch.int32, device=device)
+        if total:
+            bounds = torch.arange(tiles + 1, dtype=where.dtype, device=device)
+            torch.searchsorted(where, bounds, out_int32=True, out=begin)
         return Entries(first_slot, listed.index_select(0, slots), slots, begin)
 
 
