@@ -20,6 +20,7 @@ VERBS = {
     "render": "draw a finished run as images or a video",
     "eval": "judge a finished run by its held-out views",
     "export": "write splats in another format",
+    "clean": "leave out splats that no input view needs",
     "view": "look at a run or a splat file in the browser",
     "finetune": "train a diffusion prior on scenes of your own",
     "bench": "measure gsopt on this machine",

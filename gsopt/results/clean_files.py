@@ -1,0 +1,81 @@
+"""`gsopt clean`: the files of a run before and after, a picture of the difference, and the way back."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool
+from PIL import Image
+from torch import Tensor
+
+from gsopt.data.scene import View
+from gsopt.errors import InputError, UsageError
+from gsopt.events import write_atomic
+from gsopt.formats import is_antialiased, save_splats
+from gsopt.gaussians import Gaussians
+from gsopt.geometry import sh
+from gsopt.geometry.camera_paths import turntable_path
+from gsopt.geometry.cameras import Cameras
+from gsopt.results.finished_run import FinishedRun, draw, look_at_point, with_longest_side
+from gsopt.results.video import as_image
+
+SPLATS, BEFORE, PICTURE = "splat.ply", "splat.before-clean.ply", "clean.png"
+SIDE, GAP, ROWS = 360, 8, 3
+
+
+def replace_splats(run: FinishedRun, keep: Bool[Tensor, "N"]) -> None:
+    """Write splat.ply without the other splats; the first one stays as splat.before-clean.ply."""
+    splats, before = run.path / SPLATS, run.path / BEFORE
+    antialiased = is_antialiased(splats)
+    if before.is_symlink():
+        raise InputError(f"{before} must not be a symbolic link, got one. Remove it.")
+    if not before.exists():
+        os.link(splats, before)
+    save_splats(splats, run.gaussians.select(keep), antialiased=antialiased)
+
+
+def undo(run: Path) -> None:
+    """Bring splat.before-clean.ply back as splat.ply."""
+    before = run / BEFORE
+    if before.is_symlink() or not before.is_file():
+        raise UsageError(f"{run} was not cleaned: there is no {BEFORE}. Nothing was changed.")
+    os.replace(before, run / SPLATS)
+
+
+def write_picture(run: FinishedRun, keep: Bool[Tensor, "N"], views: tuple[View, ...]) -> None:
+    """Write clean.png into the run; a link in its place is replaced, not followed."""
+    buffer = io.BytesIO()
+    picture(run, keep, views).save(buffer, "PNG")
+    write_atomic(run.path / PICTURE, buffer.getvalue())
+
+
+def picture(run: FinishedRun, keep: Bool[Tensor, "N"], views: tuple[View, ...]) -> Image.Image:
+    """Before, after and what goes in red, from the first input camera and two places of the turntable."""
+    cameras = Cameras.cat([view.camera.resized(views[0].camera.width, views[0].camera.height) for view in views])
+    path = turntable_path(cameras, ROWS, look_at_point(run.gaussians, cameras))
+    shots = [views[0].camera, *(path[i] for i in range(1, ROWS))]
+    columns = [run.gaussians, run.gaussians.select(keep), marked(run.gaussians.select(~keep))]
+    panes = [
+        [
+            as_image(draw(splats, with_longest_side(shot, SIDE), run.backend, run.settings, run.background))
+            for splats in columns
+        ]
+        for shot in shots
+    ]
+    width, height = panes[0][0].size
+    sheet = Image.new("RGB", (3 * (width + GAP) - GAP, ROWS * (height + GAP) - GAP), "white")
+    for y, row in enumerate(panes):
+        for x, pane in enumerate(row):
+            sheet.paste(pane, (x * (width + GAP), y * (height + GAP)))
+    return sheet
+
+
+def marked(gaussians: Gaussians) -> Gaussians:
+    """The splats in opaque red, from every side."""
+    red = sh.sh0_from_rgb(torch.tensor([0.85, 0.1, 0.1])).expand(len(gaussians), 1, 3)
+    opaque = torch.full_like(gaussians.logit_opacities, 4.0)
+    return replace(gaussians, sh0=red.contiguous(), shN=torch.zeros_like(gaussians.shN), logit_opacities=opaque)
