@@ -64,6 +64,21 @@ def finish_install(scene: Any, work: job.Job) -> None:
     scene.gsopt.doctor = f"gsopt is installed: {python}"
 
 
+def finish_page(scene: Any, work: job.Job) -> None:
+    page = Path(work.product)
+    if not page.is_file() or page.stat().st_mtime < work.started - 1:
+        raise GsoptError(job.complaint(work))
+    if not bpy.app.background:
+        bpy.ops.wm.url_open(url=page.as_uri())
+
+
+def finish_clean(scene: Any, work: job.Job) -> None:
+    picture = Path(work.product)
+    if not picture.is_file() or picture.stat().st_mtime < work.started - 1:
+        raise GsoptError(job.complaint(work))
+    scene.gsopt.message = job.tail(Path(work.folder) / job.OUTPUT).strip()[-300:]
+
+
 FINISH: dict[str, Callable[[Any, job.Job], None]] = {
     "dataset": finish_dataset,
     "poses": finish_poses,
@@ -71,6 +86,8 @@ FINISH: dict[str, Callable[[Any, job.Job], None]] = {
     "prompts": finish_prompts,
     "doctor": finish_doctor,
     "install": finish_install,
+    "page": finish_page,
+    "clean": finish_clean,
 }
 
 

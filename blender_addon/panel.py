@@ -190,6 +190,17 @@ def draw_outcome(layout: Any, settings: Any) -> None:
     if settings.run_status in ("stopped", "killed", "error"):
         row.operator("gsopt.resume", icon="PLAY")
     row.operator("gsopt.log", text="", icon="TEXT")
+    if settings.run_status in ("done", "stopped"):
+        draw_result(box, settings)
+
+
+def draw_result(layout: Any, settings: Any) -> None:
+    """Buttons for what comes after a run."""
+    if not show_job(layout, settings.job_page, "page") and not show_job(layout, settings.job_clean, "clean"):
+        row = layout.row(align=True)
+        row.operator("gsopt.share", icon="URL")
+        row.operator("gsopt.clean", icon="BRUSH_DATA")
+        row.operator("gsopt.undo_clean", text="", icon="LOOP_BACK")
 
 
 def draw_runs(layout: Any, settings: Any) -> None:

@@ -119,6 +119,16 @@ def install(folder: Path, package: str) -> list[str]:
     return [sys.executable, str(Path(__file__).with_name("install_gsopt.py")), str(folder), package]
 
 
+def page(python: Path, run: Path, out: Path) -> list[str]:
+    """`gsopt export`: one page for any browser."""
+    return [str(python), "-m", "gsopt", "export", str(run), "-o", str(out), "--force"]
+
+
+def clean(python: Path, run: Path) -> list[str]:
+    """`gsopt clean`: the run's splats without those that no input view needs."""
+    return [str(python), "-m", "gsopt", "clean", str(run)]
+
+
 def doctor(python: Path) -> list[str]:
     return [str(python), "-m", "gsopt", "doctor", "--json"]
 

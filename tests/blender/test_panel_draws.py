@@ -81,7 +81,7 @@ def test_an_empty_file_draws(panel: Any) -> None:
 
 
 def test_work_that_goes_on_draws_with_its_progress(panel: Any) -> None:
-    for kind in ("dataset", "poses", "prompts", "import"):
+    for kind in ("dataset", "poses", "prompts", "page", "clean", "import"):
         entry = getattr(panel, f"job_{kind}")
         entry.state, entry.share, entry.message = "RUNNING", 0.5, f"half of the {kind}"
     panel.run_status, panel.run_path = "waiting", "/runs/a"
@@ -93,6 +93,14 @@ def test_work_that_goes_on_draws_with_its_progress(panel: Any) -> None:
         assert said in text
     assert "Material Preview" in text, "Solid view is gray"
     assert "Standard" in drawn("MATERIAL") or panel.id_data.view_settings.view_transform == "Standard"
+
+
+def test_a_finished_run_can_be_shared_and_cleaned(panel: Any) -> None:
+    panel.run_status, panel.run_path, panel.run_step = "done", "/runs/a", 7
+    panel.job_clean.state, panel.job_clean.message = "FAILED", "no input views"
+    assert "no input views" in drawn()
+    panel.job_page.state, panel.job_page.message = "RUNNING", "half of the page"
+    assert "half of the page" in drawn()
 
 
 def test_what_failed_draws_with_its_reason(panel: Any) -> None:

@@ -274,3 +274,29 @@ def test_a_defect_of_ours_is_a_message_and_the_timer_goes_on(
     assert panel.job_import.state == "FAILED"
     monkeypatch.undo()
     assert bpy.ops.gsopt.import_splats(filepath=str(tmp_path / "a.ply")) == {"FINISHED"}
+
+
+def test_a_run_is_shared_and_cleaned_or_the_reason_is_told(panel: Any, tmp_path: Path) -> None:
+    """`-m gsopt export RUN -o OUT --force` and `-m gsopt clean RUN`, by a stand-in that makes their products."""
+    import bpy
+
+    for operator in (bpy.ops.gsopt.share, bpy.ops.gsopt.clean, bpy.ops.gsopt.undo_clean):
+        fails_with("no finished run", operator)
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "splat.ply").write_bytes(b"cleaned")
+    panel.run_path = str(run)
+    stand_in(tmp_path, "echo 'gsopt: The disk is full.'; exit 3")
+    fails_with("The disk is full", bpy.ops.gsopt.share)
+    fails_with("The disk is full", bpy.ops.gsopt.clean)
+    stand_in(
+        tmp_path, 'if [ "$3" = export ]; then echo page > "$6"; else echo picture > "$4/clean.png"; echo "3 go"; fi'
+    )
+    bpy.ops.gsopt.share()
+    assert (run / "page.html").read_text() == "page\n"
+    bpy.ops.gsopt.clean()
+    assert "3 go" in panel.message
+    fails_with("was not cleaned", bpy.ops.gsopt.undo_clean)
+    (run / "splat.before-clean.ply").write_bytes(b"before")
+    bpy.ops.gsopt.undo_clean()
+    assert (run / "splat.ply").read_bytes() == b"before"
