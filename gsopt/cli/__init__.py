@@ -16,6 +16,7 @@ VERBS = {
     "sfm": "find the poses of photos or a video",
     "masks": "cut the object out of photos",
     "prompts": "turn an expert's words into the prompts that guide a reconstruction",
+    "reconstruct": "go from photos or a video to a report: poses, masks, training",
     "train": "learn Gaussians from posed images",
     "render": "draw a finished run as images or a video",
     "eval": "judge a finished run by its held-out views",
@@ -29,7 +30,7 @@ VERBS = {
 }
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
-LOGGED = ("train", "demo")
+LOGGED = ("train", "demo", "reconstruct")
 """Verbs whose lines stand in log.txt too: no output is lost."""
 
 

@@ -89,7 +89,8 @@ def find_model(named: str | None = None) -> Path:
         if files.is_regular(folder / name):
             return folder / name
     raise MissingDependency(
-        f"Cutting out an object needs a mask model, and none was found: give `--model FILE`, set {MODEL_VARIABLE}, or "
+        f"Cutting out an object needs a mask model, and none was found: give `--model FILE` (`--mask-model FILE` "
+        f"in a run; a run needs none with `--masks none`), set {MODEL_VARIABLE}, or "
         f"put u2net.onnx into {folder} (pip install rembg; rembg d u2net). gsopt downloads nothing by itself."
     )
 
