@@ -15,7 +15,7 @@ from gsopt.config.presets import Preset
 
 @dataclass(frozen=True)
 class Flags:
-    """Poses, masks, training and report of one object in a single command. What an earlier call finished is kept: the
+    """Poses, masks, training and report of one object in a single command. A later call keeps what was finished: the
     poses, the masks, and the run up to its newest checkpoint."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
