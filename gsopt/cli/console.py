@@ -52,8 +52,8 @@ class RunConsole:
                 self._begin(event)
             case "warning":
                 self.say(f"warning: {event['message']}")
-            case "guidance":
-                self.say(f"guidance: {event['message']}")
+            case "guidance" | "library" as kind:
+                self.say(f"{kind}: {event['message']}")
             case "progress":
                 self._progress(event)
             case "stopped":

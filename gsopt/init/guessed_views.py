@@ -47,7 +47,7 @@ def with_guessed_views(scene: Scene, backend: Backend) -> Scene:
     if len(scene.train) != 1 or not scene.has_alpha:
         return scene
     photo = small_photos(scene.train, 1)[0]
-    grid = inflated(photo, scene.extent)
+    grid = scene.body or inflated(photo, scene.extent)
     if grid is None:
         return scene
     cameras = surrounding_cameras(photo, scene.extent)

@@ -64,7 +64,7 @@ def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoi
     if covered > _FULL_COVERAGE:
         return None
     if scene.guessed:
-        grid = inflated(photos[0], scene.extent)
+        grid = scene.body or inflated(photos[0], scene.extent)
     else:
         grid = carve(photos, find_focus([photo.camera for photo in photos], scene.extent))
     if grid is None:

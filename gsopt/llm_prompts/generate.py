@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from gsopt import check
 from gsopt._optional import require
-from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.guidance import GuidanceConfig, library_of
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, write_atomic
 from gsopt.llm_prompts.deduplicate import without_duplicates
 from gsopt.llm_prompts.expand import PromptSpec, expand, expert_prompt, fill_with_template
 from gsopt.llm_prompts.subject import find_object
-from gsopt.llm_prompts.templates import Template, load_template
+from gsopt.llm_prompts.templates import Template, for_library, load_template
 from gsopt.llm_prompts.tokens import MAX_TOKENS, TokenCounter, counter_for
 from gsopt.sds.prompts import MAX_NAME_LENGTH, MAX_NOTES_LENGTH, MAX_WARNINGS, Prompt, PromptSet, Provenance
 
@@ -87,6 +87,8 @@ def make_prompts(job: PromptJob, report: Report) -> PromptResult:
     fallback to the template is allowed.
     """
     template = load_template(job.domain)
+    if library_of(job.prior) is not None:
+        template = for_library(template)
     spec = PromptSpec(job.notes.strip(), job.category.strip() or find_object(job.notes), job.n, job.negatives)
     folder = prior_folder(job.prior)
     counter = counter_for(folder)
@@ -112,6 +114,8 @@ def prior_folder(prior: str) -> Path | None:
     """
     from gsopt.sds.select_prior import EMBEDDED, embedded_prior_obstacle
 
+    if library_of(prior) is not None:
+        return None
     if prior in ("auto", "embedded"):
         return EMBEDDED if embedded_prior_obstacle() is None else None
     path = Path(prior).expanduser()

@@ -8,6 +8,7 @@
     # System        text: the role of the language model
     # Task          text: its task
     # Questions     lists, one entry per line that begins with "- "
+    # Library       questions where the prior is a shape library, which looks for kinds of things
     # Words         - femur @back => description used if the notes have that word (for one view only)
 
 Lists of a template precede those it extends, texts replace them. Slots in braces are filled by plain replacement,
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -30,7 +31,7 @@ DOMAINS = ("generic", "medicine", "robotics", "arvr", "environment")
 MAX_FILE_BYTES = 256 << 10
 KEYS = ("name", "title", "extends")
 TEXTS = ("system", "task")
-LISTS = ("phrases", "front", "side", "back", "top", "negative", "questions", "rewriting")
+LISTS = ("phrases", "front", "side", "back", "top", "negative", "questions", "library", "rewriting")
 SECTIONS = (*TEXTS, *LISTS, "words")
 SLOT = re.compile(r"\{([a-z_]+)\}")
 COMMON_SLOTS = ("notes", "object", "a_object")
@@ -71,6 +72,12 @@ def load_template(domain: str) -> Template:
             f"`--domain` must be one of {', '.join(DOMAINS)} or a template file, got {domain!r:.200}. Pick one."
         )
     return _merged(path)
+
+
+def for_library(template: Template) -> Template:
+    """The template with its questions for a shape library first: kind, material, parts, proportions."""
+    asked = template.lists["library"] + template.lists["questions"]
+    return replace(template, lists={**template.lists, "questions": asked})
 
 
 def fill(text: str, values: Mapping[str, str]) -> str:

@@ -6,7 +6,7 @@ import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsopt.config.guidance import GuidanceConfig
+from gsopt.config.guidance import GuidanceConfig, library_of
 from gsopt.errors import UsageError
 
 DEFAULT_WEIGHT = 0.2
@@ -15,6 +15,7 @@ EMBEDDED = Path(__file__).with_name("embedded")
 NOT_ASKED = f"nobody asked for a prior (`--lambda_sds {DEFAULT_WEIGHT}`, `--prior` or words do)"
 """The one that ships never gained more than chance where nobody asked (docs/decisions/0010-prior-on-request.md)."""
 NO_WEIGHTS = "this copy of gsopt carries no prior; name one with --prior sd21, a folder or a hub id"
+LIBRARY = "a shape library completes the first shape and guides no step"
 NO_DIFFUSERS = "the embedded prior needs diffusers: pip install 'gsopt[sds]'"
 
 
@@ -33,6 +34,8 @@ def select_prior(config: GuidanceConfig) -> PriorSelection:
     """Selects prior and weight of a new run. Raises UsageError when guidance is requested and no prior is available."""
     if config.lambda_sds == 0:
         return PriorSelection(None, 0.0, "lambda_sds is 0")
+    if library_of(config.prior) is not None:
+        return PriorSelection(None, 0.0, LIBRARY)
     requests = guidance_flags(config)
     if not requests:
         return PriorSelection(None, 0.0, NOT_ASKED)

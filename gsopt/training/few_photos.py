@@ -26,6 +26,7 @@ GUESSED = (
     "One photo shows one side: depth and the other sides are a guess, the silhouette inflated to a body in the photo's "
     "colors. A second photo from the side helps most."
 )
+LIKENED = GUESSED.replace("the silhouette inflated to a body", "shapes of a library, mixed,")
 TURNED = (
     "One photo shows one side: the other sides are a guess. The silhouette is that of a thing which looks the same "
     "from all around an upright axis, and that is assumed. A second photo from the side tells."
@@ -42,7 +43,8 @@ def few_photo_warnings(scene: Scene) -> tuple[str, ...]:
     faults = [fault for view, photo in zip(scene.train, photos, strict=True) for fault in _mask_faults(view, photo)]
     faults += _direction_faults(scene)
     if scene.completed:
-        faults.append(GUESSED if scene.guessed else TURNED)
+        guess = GUESSED if scene.body is None else LIKENED
+        faults.append(guess if scene.guessed else TURNED)
     return tuple(faults)
 
 

@@ -30,6 +30,7 @@ from gsopt.training.finite import require_finite, require_finite_loss
 from gsopt.training.guided.session import RunGuidance
 from gsopt.training.guided.start import start_guidance
 from gsopt.training.interrupt import StopRequest
+from gsopt.training.library_body import with_library_body
 from gsopt.training.mirror_images import with_recorded_mirrors
 from gsopt.training.plan import RunPlan, guesses
 from gsopt.training.run_directory import Listener, RunDirectory, opened
@@ -81,6 +82,7 @@ def train(
         with one_torch_thread(), on_its_gpu(backend):
             scene, repaired = load_with_agreeing_masks(config.data)
             scene = with_recorded_mirrors(config, scene, directory)
+            scene = with_library_body(config, scene, backend, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)
             plan = RunPlan.of(config, scene)

@@ -8,6 +8,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+from gsopt.config.guidance import library_of
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.data.sfm.reuse import needs_poses, posed_scene
 from gsopt.data.sfm.settings import SfmConfig
@@ -20,6 +21,7 @@ from gsopt.results.evaluation import evaluate, read_metrics
 from gsopt.results.report import write_report
 from gsopt.training.guided.start import require_guidance
 from gsopt.training.interrupt import Stopped, StopRequest
+from gsopt.training.library_body import require_library
 from gsopt.training.loop import TrainResult, train
 from gsopt.training.run_directory import Listener, opened, refuse_another_run
 
@@ -59,6 +61,7 @@ def reconstruct(
     if not resume:
         refuse_another_run(run)
         require_guidance(config.guidance)
+        require_library(config.guidance)
     find_vgg_weights()  # a variable that names no file is noticed now, not after the training
     config = _with_masks(_with_poses(config, run, log), run, log)
     with StopRequest(run / "stop") as stop:
@@ -111,7 +114,9 @@ def _absolute_masks(choice: str) -> str:
 
 
 def _absolute(name: str) -> str:
-    """The absolute path of something that exists, any other name as it is."""
+    """The absolute path of something that exists, any other name as it is; `library:PATH` keeps its kind."""
+    if named := library_of(name):
+        return f"library:{_absolute(named)}"
     path = Path(name).expanduser()
     return str(path.absolute()) if name and path.exists() else name
 

@@ -167,6 +167,16 @@ def test_structured_output_is_asked_for_with_the_schema_of_what_is_wanted(tmp_pa
     assert server.asked[0]["path"] == "/v1/chat/completions"
 
 
+def test_for_a_library_the_model_is_asked_for_kind_material_parts_and_proportions(tmp_path: Path) -> None:
+    with serving([VALID]) as server:
+        assert run(tmp_path, server.url) == 0
+        assert run(tmp_path, server.url, "--prior", "library", "--overwrite") == 0
+    plain, asked = (request["body"]["messages"][1]["content"] for request in server.asked)
+    for wanted in ("kind of thing is a chair", "made of, in one word", "parts stand out", "typical proportions"):
+        assert wanted in asked
+        assert wanted not in plain
+
+
 @pytest.mark.parametrize("thought", [None, "", "<think>The chair"])
 def test_a_model_that_spent_all_on_its_thoughts_gets_more_room(tmp_path: Path, thought: str | None) -> None:
     with serving([completion(thought, "length"), VALID]) as server:

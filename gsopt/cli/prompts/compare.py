@@ -70,7 +70,10 @@ def main(argv: Sequence[str]) -> int:
     from gsopt.training.loop import one_torch_thread
 
     choice = select_prior(config.guidance)
-    assert choice.name is not None  # a weight was given: a prior that is not there is an error
+    if choice.name is None:  # a weight was given: a prior that is not there is an error
+        raise UsageError(
+            f"`--prior` {flags.prior!r:.200} guides no step, so no prompts can be compared: {choice.reason}."
+        )
     prior = open_prior(choice.name, config.guidance)
     report(f"prior {prior.name}")
     with one_torch_thread():

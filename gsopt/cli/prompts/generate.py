@@ -53,7 +53,8 @@ class Flags:
     fallback: tyro.conf.FlagCreatePairsOff[bool] = False
     """Let the template step in where the model cannot be had or gives nothing usable; the file says so."""
     prior: Annotated[str, arg(metavar="PRIOR")] = "auto"
-    """Prior whose tokenizer, CLIP and pipeline are used: embedded, sd21, a diffusers folder, a hub id."""
+    """Prior whose tokenizer, CLIP and pipeline are used: embedded, sd21, a diffusers folder, a hub id; or library, for
+    which a language model is asked more."""
     clip: Annotated[str, arg(metavar="FOLDER")] = ""
     """A CLIP model that scores the prompts, where the prior has none."""
     review: tyro.conf.FlagCreatePairsOff[bool] = False

@@ -42,7 +42,8 @@ def html_document(title: str, body: str, extra_style: str = "", policy: str = PO
 
 def page(report: Report) -> str:
     """The whole document."""
-    sections = [header(report), messages(report), views(report), inputs(report), report.cameras, report.guidance]
+    sections = [header(report), messages(report), views(report), inputs(report), report.library, report.cameras]
+    sections += [report.guidance]
     sections += [progress_charts(report), settings(report)]
     body = f"<main>\n{''.join(sections)}</main>\n{footer(report)}"
     title = f"{report.name} · gsopt report"

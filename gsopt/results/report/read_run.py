@@ -21,6 +21,7 @@ from gsopt.results.finished_run import FinishedRun, camera_path, open_run, truth
 from gsopt.results.report.cameras_section import cameras_section
 from gsopt.results.report.embedded_images import shrunk
 from gsopt.results.report.guidance_section import guidance_section
+from gsopt.results.report.library_section import library_section
 from gsopt.results.report.values import number, text
 from gsopt.results.video import as_image
 from gsopt.results.web.page import viewer_element
@@ -88,6 +89,8 @@ class Report:
     """Replaces the viewer."""
     guidance: str = ""
     """Finished HTML."""
+    library: str = ""
+    """Finished HTML."""
     cameras: str = ""
     """Finished HTML."""
 
@@ -107,6 +110,7 @@ def read_run(run: Path, config: TrainConfig) -> Report:
     )
     messages += [message for event in events if (message := _message(event)) is not None]
     report.guidance = guidance_section(run, messages)
+    report.library = library_section(run, messages)
     report.cameras = cameras_section(Path(config.data.path), run, messages)
     _add_figures(report)
     try:
