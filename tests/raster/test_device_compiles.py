@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import pytest
 
 from gsopt.errors import MissingDependency
 from gsopt.raster.device import compiler
-from gsopt.raster.device.compiler import CUDA, HIP, Compiler, find_compiler
+from gsopt.raster.device.compiler import CUDA, HIP, Compiler, builtins_beside, find_compiler
 from gsopt.raster.device.layout import kernels
 from gsopt.raster.device.source import program
 
@@ -66,3 +67,10 @@ def test_only_the_version_that_torch_was_built_for_is_taken() -> None:
     assert not compiler._is_version("libnvrtc.so.12", "13")
     assert compiler._is_version("nvrtc64_120_0.dll", "12")
     assert not compiler._is_version("nvrtc64_130_0.dll", "12")
+
+
+def test_nothing_is_loaded_from_the_folder_one_works_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "libnvrtc-builtins.so.13.0").write_bytes(b"a stranger's")
+    monkeypatch.chdir(tmp_path)
+    assert builtins_beside(Path("libnvrtc.so")) == []
+    assert builtins_beside(tmp_path / "libnvrtc.so") == [tmp_path / "libnvrtc-builtins.so.13.0"]

@@ -51,6 +51,7 @@ class Compiler:
     def __init__(self, path: Path | str, dialect: Dialect = CUDA) -> None:
         self.path = str(path)
         self._dialect = dialect
+        self._builtins = [ctypes.CDLL(str(file)) for file in builtins_beside(Path(path))]
         self._library = ctypes.CDLL(self.path)
 
     @property
@@ -129,6 +130,13 @@ def remedy(dialect: Dialect, major: str | None) -> str:
         return "Install torch for ROCm: pip install torch --index-url https://download.pytorch.org/whl/rocm6.4"
     name = "nvidia-cuda-nvrtc-cu12" if major == "12" else "nvidia-cuda-nvrtc"
     return f"Install it with: pip install {name}"
+
+
+def builtins_beside(library: Path) -> list[Path]:
+    """Returns what NVRTC before 13.5 opens by name alone; it finds only what is loaded already."""
+    if not library.is_absolute():  # a name, not a file of ours: nothing of the folder one works in is loaded
+        return []
+    return [file for file in sorted(library.parent.glob("*nvrtc-builtins*")) if ".alt." not in file.name]
 
 
 def installed(dialect: Dialect) -> list[Path]:
