@@ -13,10 +13,11 @@ from shapes import RED, ellipsoid_scene, spread_cameras
 from gsopt.config.train import InitConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
+from gsopt.geometry.focus import world_up
 from gsopt.geometry.projection import project
 from gsopt.init import first_gaussians
 from gsopt.init.guessed_views import COLOR_WEIGHT, COUNT, with_guessed_views
-from gsopt.init.inflation import inflated, silhouette_distances, world_up
+from gsopt.init.inflation import inflated, silhouette_distances
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.api import make_backend
 
@@ -115,7 +116,7 @@ def test_a_silhouette_of_one_pixel_is_a_small_body_and_an_empty_one_none() -> No
 
 @pytest.mark.parametrize(("roll", "is_z"), [(0, True), (2, True), (20, False), (180, False)])
 def test_up_is_z_unless_the_photo_is_rolled_against_it(roll: float, is_z: bool) -> None:
-    up = world_up(camera(30, roll).to(torch.float32))
+    up = world_up(camera(30, roll).to(torch.float32).viewmats)
     assert (float(up[2]) > 0.999) == is_z
     assert float(up.norm()) == pytest.approx(1, abs=1e-5)
 
