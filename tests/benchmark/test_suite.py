@@ -53,7 +53,8 @@ def test_views_are_a_number_ids_or_all() -> None:
     group = replace(whole.groups[0], views=("4", "2,16", "all"), scenes=("a",), runs=(("ours", 5),))
     flags = [case.flags for case in definition.cases(replace(whole, groups=(group,)), 1)]
     tail = ("--iterations", "5", "--seed", "0")
-    assert flags == [("--views", "4", *tail), ("--view-ids", "2,16", *tail), tail]
+    chosen = [("--views", "4"), ("--view-ids", "2,16"), ()]
+    assert flags == [("--lambda-sds", "0.2", *views, *tail) for views in chosen]
     assert [definition.view_count(views) for views in group.views] == ["4", "2", "all"]
 
 
