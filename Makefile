@@ -47,6 +47,19 @@ stress: $(VENV)/.for-test
 every-write: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_EVERY_WRITE=full $(PY) -m pytest tests/every_write
 
+# Coverage-guided fuzzing of every reader; inputs that reach new code are kept in tests/corpus, which `make test` replays.
+# An hour as it stands: SECONDS for each of some thirty readers.
+SECONDS ?= 110
+fuzz: $(VENV)/.for-test
+	$(PIP) atheris
+	$(PY) tests/fuzz/campaign.py $(SECONDS)
+
+# Wheels in dist/ that need no compiler to install. PYTHON312: any Python from 3.12 on.
+PYTHON312 ?= python3.12
+wheel:
+	scripts/build_wheel.sh "$(PYTHON)"
+	scripts/build_wheel.sh "$(PYTHON312)"
+
 # The tests that run kernels, on a build that stops at the first bad address or undefined behavior. -O1 halves the time to
 # compile; tests of the reference alone have no kernel to check. -S and -P: neither the editable install nor the sources are
 # imported instead of the build; --capture=sys leaves a sanitizer's report visible.

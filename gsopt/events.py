@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import json
 import os
 import time
@@ -66,9 +67,27 @@ def sync_folder(folder: Path) -> None:
 
 
 def create(temporary: Path) -> BinaryIO:
-    """A new file under this name, in the place of whatever a killed writer or a stranger left there."""
+    """A new file `.NAME.PROCESS.tmp`, in the place of whatever killed writers of NAME or a stranger left there."""
     temporary.unlink(missing_ok=True)
+    if os.name == "posix":  # elsewhere one cannot ask for a process without harm
+        for other in temporary.parent.glob(f"{glob.escape(temporary.name.rsplit('.', 2)[0])}.*.tmp"):
+            if _writer_is_dead(other):
+                other.unlink(missing_ok=True)
     return open(temporary, "xb")
+
+
+def _writer_is_dead(temporary: Path) -> bool:
+    """True when no process has the number in the name `.NAME.PROCESS.tmp`."""
+    number = temporary.name.rsplit(".", 2)[1]
+    if not number.isascii() or not number.isdigit() or not 0 < int(number) < 1 << 31:
+        return False
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def refuse_links(run: Path) -> None:

@@ -5,6 +5,10 @@
 set -euo pipefail
 python=$1 machine=${2:-x86_64}
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+if [ "$machine" != "$(uname -m)" ] && ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 12))'; then
+  echo "Python 3.12 or later is needed to compile for another machine: only the stable ABI names none." >&2
+  exit 2
+fi
 build=$PWD/build/wheel-$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 test -x "$build/bin/python" || "$python" -m venv "$build"
 export PATH=$build/bin:$PATH
@@ -16,4 +20,4 @@ export CXX="$build/bin/python -m ziglang c++ -target $machine-linux-gnu.2.17"
 _PYTHON_HOST_PLATFORM=linux-$machine python -m pip --disable-pip-version-check wheel -q --no-build-isolation --no-deps -w "$build/raw-$machine" \
   -C build-dir="$build/$machine" -C cmake.define.CMAKE_SYSTEM_NAME=Linux -C cmake.define.CMAKE_SYSTEM_PROCESSOR="$machine" \
   -C cmake.define.CMAKE_CXX_FLAGS="-include cstdio" .
-python -m auditwheel repair --plat "manylinux_2_17_$machine" -w dist "$build/raw-$machine"/*.whl
+python -m auditwheel repair --plat auto -w dist "$build/raw-$machine"/*.whl

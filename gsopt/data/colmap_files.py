@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsopt.data import files
-from gsopt.errors import InputError
+from gsopt.errors import InputError, shortened
 
 CAMERA_MODELS = (
     ("SIMPLE_PINHOLE", 3),
@@ -192,4 +192,4 @@ def _records(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _bad_line(path: Path, line: int, error: Exception) -> InputError:
-    return InputError(f"{path}, line {line}, is not as COLMAP writes it: {error}. {_REMEDY}")
+    return InputError(f"{path}, line {line}, is not as COLMAP writes it: {shortened(str(error))}. {_REMEDY}")

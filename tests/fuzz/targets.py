@@ -1,0 +1,183 @@
+"""What is fuzzed: every reader of bytes that a stranger may have written, the law it keeps, and first inputs."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from splat_laws import reads_or_refuses, require_short
+from tiny_scenes import cloud, write_dataset
+
+from blender_addon.core import cameras, colmap, job, ply, spz
+from blender_addon.core import prompts as panel_prompts
+from blender_addon.core.errors import GsoptError as PanelError
+from blender_addon.core.run_follower import Follower
+from gsopt.benchmark.suite import definition
+from gsopt.config.train import TrainConfig
+from gsopt.data import colmap_files, pointcloud, transforms
+from gsopt.errors import GsoptError
+from gsopt.events import read_events
+from gsopt.formats import SUFFIXES, save_splats
+from gsopt.llm_prompts.expand import PromptSpec
+from gsopt.llm_prompts.reply import read_reply
+from gsopt.llm_prompts.tokens import ESTIMATED_COUNTER
+from gsopt.results.report import write_report
+from gsopt.sds.prompts import Prompt, PromptSet, read_set, write_set
+from gsopt.training.checkpoint import read_checkpoint, save_checkpoint
+
+Law = Callable[[Path], None]
+
+
+@dataclass(frozen=True)
+class Target:
+    """One reader."""
+
+    file: str
+    """Name of the file that it reads."""
+    law: Law
+    seeds: Callable[[Path], list[bytes]]
+    """Valid inputs, made in a scratch folder."""
+    beside: Mapping[str, bytes] = field(default_factory=dict)
+    """Other files of the folder, by name."""
+
+
+def clear(read: Callable[[Path], object], errors: type[Exception] = GsoptError) -> Law:
+    """Reads the file, or refuses it in a message of bounded length; any other exception breaks the law."""
+
+    def law(path: Path) -> None:
+        try:
+            read(path)
+        except errors as error:
+            require_short(error, path)
+
+    return law
+
+
+def never_raises(path: Path) -> None:
+    """The reply of a language model."""
+    answer = path.read_bytes().decode("utf-8", "replace")
+    prompts = read_reply(answer, PromptSpec("worn oak chair", "chair", 8, 2), "llm:a", ESTIMATED_COUNTER, ()).prompts
+    assert all(prompt.text.isprintable() for prompt in prompts)
+
+
+def report(path: Path) -> object:
+    """The report of a run without splats or dataset."""
+    return write_report(path.parent)
+
+
+def follow(path: Path) -> object:
+    """What the panel does with the events of a run."""
+    return Follower(path.parent).poll()
+
+
+def saved(suffix: str) -> Callable[[Path], list[bytes]]:
+    def seeds(folder: Path) -> list[bytes]:
+        path = folder / f"seed{suffix}"
+        save_splats(path, cloud(3, seed=0))
+        return [path.read_bytes()]
+
+    return seeds
+
+
+def dataset(name: str) -> Callable[[Path], list[bytes]]:
+    return lambda folder: [(write_dataset(folder / "scene", 1, 1) / name).read_bytes()]
+
+
+def checkpoint(folder: Path) -> list[bytes]:
+    return [save_checkpoint(folder, 1, dict(cloud(2, seed=0).items()), {"seconds": 1.0}).read_bytes()]
+
+
+def prompt_file(folder: Path) -> list[bytes]:
+    write_set(folder / "prompts.json", PromptSet((Prompt("a worn oak chair", source="user"),)))
+    return [(folder / "prompts.json").read_bytes()]
+
+
+def texts(*lines: str) -> Callable[[Path], list[bytes]]:
+    return lambda folder: [line.encode() for line in lines]
+
+
+EVENTS = (
+    '{"v": 1, "seq": 0, "kind": "started", "total": 30, "step": 0, "pid": 1, "n": 5}\n'
+    '{"v": 1, "seq": 1, "kind": "progress", "step": 3, "total": 30, "loss": 0.1, "psnr": 20.0, "n": 5}\n'
+    '{"v": 1, "seq": 2, "kind": "preview", "step": 5, "path": "previews/step_000005.ply"}\n'
+    '{"v": 1, "seq": 3, "kind": "done", "step": 30, "n": 5, "seconds": 1.0}\n'
+)
+METRICS = '{"protocol": {}, "mean": {"psnr": 20.0}, "views": [{"name": "a.png", "psnr": 20.0}]}'
+JOB = json.dumps(
+    {
+        "version": job.VERSION,
+        "kind": "train",
+        "folder": "",
+        "product": "",
+        "identity": "",
+        "arguments": ["python", "-m", "gsopt"],
+        "pid": 1,
+        "total": 10,
+        "started": 1.0,
+    }
+)
+REPLY = (
+    '{"all": [{"text": "a worn oak chair with four legs", "why": "use"}], "negative": [{"text": "blurry", "why": ""}]}'
+)
+CAMERAS = "# cameras\n1 PINHOLE 24 24 30 30 12 12\n2 SIMPLE_RADIAL 24 24 30 12 12 0.1\n"
+IMAGES = "# images\n1 1 0 0 0 0 0 3 1 a.png\n0 0 -1\n"
+POINTS = "# points\n1 0 0 0 255 0 0 0.5 1 0\n"
+SUITE = (Path(definition.__file__).parent.parent / "suites" / "smoke.toml").read_text(encoding="utf-8")
+
+CONFIG = json.dumps({"config": TrainConfig().to_dict()}).encode()
+
+TARGETS = {
+    **{f"splats{suffix}": Target(f"a{suffix}", reads_or_refuses, saved(suffix)) for suffix in SUFFIXES},
+    "points.ply": Target("points.ply", clear(pointcloud.read_points_ply), saved(".ply")),
+    "transforms.json": Target(
+        "transforms_train.json",
+        clear(lambda path: transforms.read_transforms(path.parent)),
+        dataset("transforms_train.json"),
+    ),
+    "cameras.txt": Target("cameras.txt", clear(colmap_files.read_cameras), texts(CAMERAS)),
+    "images.txt": Target("images.txt", clear(colmap_files.read_images), texts(IMAGES)),
+    "points3D.txt": Target("points3D.txt", clear(colmap_files.read_points), texts(POINTS)),
+    "cameras.bin": Target("cameras.bin", clear(colmap_files.read_cameras), texts("\1" + "\0" * 7 + "\1" + "\0" * 60)),
+    "images.bin": Target("images.bin", clear(colmap_files.read_images), texts("\1" + "\0" * 80)),
+    "points3D.bin": Target("points3D.bin", clear(colmap_files.read_points), texts("\1" + "\0" * 80)),
+    "config.json": Target("config.json", clear(TrainConfig.read), lambda folder: [CONFIG]),
+    "events.jsonl": Target("events.jsonl", clear(read_events), texts(EVENTS)),
+    "report of metrics.json": Target("metrics.json", clear(report), texts(METRICS), {"config.json": CONFIG}),
+    "report of events.jsonl": Target("events.jsonl", clear(report), texts(EVENTS), {"config.json": CONFIG}),
+    "checkpoint": Target("step_000001.safetensors", clear(read_checkpoint), checkpoint),
+    "prompts.json": Target("prompts.json", clear(read_set), prompt_file),
+    "reply": Target("reply.txt", never_raises, texts(REPLY)),
+    "suite.toml": Target("own.toml", clear(lambda path: definition.load(str(path))), texts(SUITE)),
+    "panel splats.ply": Target("a.ply", clear(ply.read_ply, PanelError), saved(".ply")),
+    "panel splats.spz": Target("a.spz", clear(spz.read_spz, PanelError), saved(".spz")),
+    "panel prompts.json": Target("prompts.json", clear(panel_prompts.read_prompts, PanelError), prompt_file),
+    "panel job.json": Target(job.RECORD, clear(lambda path: job.read_job(path.parent), PanelError), texts(JOB)),
+    "panel events.jsonl": Target("events.jsonl", clear(follow, PanelError), texts(EVENTS)),
+    "panel transforms.json": Target(
+        "transforms_train.json",
+        clear(lambda path: cameras.from_transforms(path, "train"), PanelError),
+        dataset("transforms_train.json"),
+    ),
+    "panel cameras.bin": Target(
+        "cameras.bin",
+        clear(lambda path: colmap.read_pictures(path.parent), PanelError),
+        texts("\1" + "\0" * 7 + "\1" + "\0" * 3 + "\1" + "\0" * 60),
+        {"images.bin": b"\0" * 8},
+    ),
+}
+
+
+def place(target: Target, folder: Path) -> Path:
+    """Writes the other files and returns the path of the input."""
+    for name, content in target.beside.items():
+        (folder / name).write_bytes(content)
+    return folder / target.file
+
+
+def seeds_of(target: Target) -> list[bytes]:
+    """Valid inputs of a target."""
+    with tempfile.TemporaryDirectory() as folder:
+        return target.seeds(Path(folder))
