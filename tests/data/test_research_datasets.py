@@ -22,7 +22,7 @@ from gsopt.geometry.cameras import opengl_from_viewmats
 
 COUNT = 5
 FOCAL = 20.0
-HEAD = Path("/work/shared/data/views/ethiopianHead_800")
+HEAD = Path(__file__).resolve().parents[3] / "shared" / "data" / "views" / "ethiopianHead_800"
 
 
 def llff_rows(viewmats: torch.Tensor, size: float = SIZE, focal: float = FOCAL) -> np.ndarray:

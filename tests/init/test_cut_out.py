@@ -23,8 +23,9 @@ from gsopt.init.cut_out import RECORD, cut_out, with_made_masks
 from gsopt.init.object_box import box_around, box_of_points, object_points, overlap
 from gsopt.init.thumbnails import small_photos
 
-MODEL = Path("/work/shared/data/weights/u2netp.onnx")
-HEAD = Path("/work/shared/data/views/ethiopianHead_800/images")
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+MODEL = SHARED / "weights" / "u2netp.onnx"
+HEAD = SHARED / "views" / "ethiopianHead_800" / "images"
 needs_model = pytest.mark.skipif(not MODEL.is_file(), reason=f"{MODEL} is not on this machine")
 
 

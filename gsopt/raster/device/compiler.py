@@ -127,7 +127,7 @@ def find_compiler(dialect: Dialect = CUDA, major: str | None = None) -> Compiler
 def remedy(dialect: Dialect, major: str | None) -> str:
     """The pip line that brings the library."""
     if dialect is HIP:
-        return "Install torch for ROCm: pip install torch --index-url https://download.pytorch.org/whl/rocm6.4"
+        return "Install torch for ROCm: pip install torch, with the index that torch's start page names for your ROCm."
     name = "nvidia-cuda-nvrtc-cu12" if major == "12" else "nvidia-cuda-nvrtc"
     return f"Install it with: pip install {name}"
 

@@ -15,7 +15,7 @@ from gsopt.raster.device.driver import CUDA_DRIVER, HIP_DRIVER, Driver, open_dri
 from gsopt.raster.device.layout import kernels
 from gsopt.raster.device.source import program
 
-INSTALL = "pip install torch --index-url https://download.pytorch.org/whl/cu130"
+INSTALL = "pip install torch, with the index that torch's start page names for your CUDA"
 
 
 @dataclass(frozen=True)
