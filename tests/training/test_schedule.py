@@ -167,5 +167,5 @@ def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
     ("views", "images", "drawn"), [(4, 4, 4), (4, 24, 8), (8, 8, 4), (8, 48, 4), (16, 16, 2), (5, 0, 0)]
 )
 def test_the_more_photos_the_fewer_mirror_images(views: int, images: int, drawn: int) -> None:
-    scene = SimpleNamespace(train=(None,) * views, mirrored=(None,) * images, guessed=())
+    scene = SimpleNamespace(train=(None,) * views, mirrored=(None,) * images, completed=False)
     assert plan.extra_per_epoch(scene) == drawn  # type: ignore[arg-type]
