@@ -1,5 +1,5 @@
 # gsopt on a CPU: docker build -f containers/cpu.Dockerfile -t gsopt . && docker run --rm -v "$PWD:/work" gsopt train PHOTOS -m RUN
-# torch's CPU builds are a fifth as large as what the default index gives: name their index in PIP_EXTRA_INDEX_URL.
+# torch's CPU builds are much smaller than what the default index gives: name their index in PIP_EXTRA_INDEX_URL.
 FROM python:3.11-slim-bookworm AS build
 RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
 COPY . /source

@@ -1,4 +1,4 @@
-"""Drives `worker.py`: command lines of gsopt on a disk that fails at a chosen call."""
+"""This module drives `worker.py`, which runs command lines of gsopt on a disk that fails at a chosen call."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The k-th change of the disk fails, for every k: killed, full, broken, half written. Resumed, nothing is missing.
+"""The k-th change of the disk fails, for every k: killed, full, broken, half written. Nothing is missing after resuming.
 
 An ordinary run of the tests takes a sample of the k; GSOPT_EVERY_WRITE=full takes every one (`make every-write`).
 """
@@ -46,19 +46,19 @@ class Work:
 
 
 def same_command(folder: Path) -> list[str]:
-    """Adds nothing."""
+    """The same command goes on; nothing is added to it."""
     return []
 
 
 def named(*patterns: str) -> Callable[[Path], Files]:
-    """Reads the files of these names."""
+    """A reader of the files of these names."""
     return lambda folder: {
         str(path.relative_to(folder)): path.read_bytes() for name in patterns for path in sorted(folder.glob(name))
     }
 
 
 def nothing(folder: Path) -> None:
-    """Holds of any folder."""
+    """There is nothing to check."""
 
 
 def no_step_is_lost(folder: Path) -> None:
@@ -143,7 +143,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def faults_of(calls: int, every: bool) -> Iterator[tuple[int, Fault]]:
-    """Every call with every fault, or a sample in which every fault occurs."""
+    """Pairs of a call and a fault: all of them, or a sample in which every fault occurs."""
     if every:
         yield from ((at, fault) for at in range(1, calls + 1) for fault in FAULTS)
     else:
@@ -173,7 +173,7 @@ def fresh(folder: Path, work: Work) -> Path:
 
 
 def survives(work: Work, disk: FaultyDisk, fault: Fault, at: int, folder: Path, products: Files) -> None:
-    """One fault: a clear end, nothing lost, and the same bytes once the command is given again."""
+    """A command that meets the fault ends clearly and loses nothing; given again, it writes the same bytes."""
     where = f"{fault} at call {at}"
     outcome = disk.run(work.arguments(folder), folder, fault, at)
     log = disk.log.read_text()

@@ -1,4 +1,4 @@
-"""What is fuzzed: every reader of bytes that a stranger may have written, the law it keeps, and first inputs."""
+"""The fuzzer calls every reader of bytes that a stranger may have written; each has a law and first inputs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Law = Callable[[Path], None]
 
 @dataclass(frozen=True)
 class Target:
-    """One reader."""
+    """A reader, the law it keeps, and its first inputs."""
 
     file: str
     """Name of the file that it reads."""
@@ -45,7 +45,7 @@ class Target:
 
 
 def clear(read: Callable[[Path], object], errors: type[Exception] = GsoptError) -> Law:
-    """Reads the file, or refuses it in a message of bounded length; any other exception breaks the law."""
+    """The law of readers: a file is read, or refused in a message of bounded length. Any other exception breaks it."""
 
     def law(path: Path) -> None:
         try:
@@ -57,19 +57,19 @@ def clear(read: Callable[[Path], object], errors: type[Exception] = GsoptError) 
 
 
 def never_raises(path: Path) -> None:
-    """The reply of a language model."""
+    """The law of an LLM's reply: any text is parsed without an exception."""
     answer = path.read_bytes().decode("utf-8", "replace")
     prompts = read_reply(answer, PromptSpec("worn oak chair", "chair", 8, 2), "llm:a", ESTIMATED_COUNTER, ()).prompts
     assert all(prompt.text.isprintable() for prompt in prompts)
 
 
 def report(path: Path) -> object:
-    """The report of a run without splats or dataset."""
+    """This target writes the report of a run without splats or dataset."""
     return write_report(path.parent)
 
 
 def follow(path: Path) -> object:
-    """What the panel does with the events of a run."""
+    """This target does what the panel does with the events of a run."""
     return Follower(path.parent).poll()
 
 

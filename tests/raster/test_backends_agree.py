@@ -78,7 +78,7 @@ def check_gradients(got: Gradients, expected: Gradients, floor: float) -> None:
 
 
 def both_gradients(backend: Backend, case: Case) -> tuple[Gradients, Gradients]:
-    """The backend's and the oracle's, after their images were found to agree; undecided pixels have no weight."""
+    """Gradients of the backend and of the float64 reference, once their images agree; undecided pixels have no weight."""
     decided = ~undecided_pixels(case, DECISION)
     expected, got = draw(ORACLE, case), draw(backend, single(case))
     check_images(got, expected, decided)
@@ -295,7 +295,7 @@ def test_what_was_changed_is_drawn_anew() -> None:
 
 
 def replaced(case: Case) -> Case:
-    """The same in records that no one has seen."""
+    """The same values in new records."""
     return replace(case, gaussians=replace(case.gaussians), camera=replace(case.camera))
 
 
@@ -320,7 +320,7 @@ def test_a_step_of_a_copy_is_refused(how: str) -> None:
 
 
 def test_views_of_records_go_with_them() -> None:
-    """Not with the backend, and not before."""
+    """Views of records live as long as their records, not as long as the backend."""
     known = len(cpu_backend._handles)
     case = single(make_case(3, count=30))
     for _ in range(3):
@@ -346,7 +346,7 @@ def test_neither_the_number_of_threads_nor_a_repetition_changes_a_bit(
 
 
 def everything(engine: Backend, case: Case) -> list[Tensor]:
-    """All that a step computes."""
+    """All values that a step computes."""
     frame = draw(engine, case)
     assert frame.depths is not None
     gradients = engine.backward(frame, *(v.float() for v in weights_like(case)), absgrad=True)
@@ -357,7 +357,7 @@ def everything(engine: Backend, case: Case) -> list[Tensor]:
 
 @pytest.mark.parametrize("isa", _cpu.instruction_sets())
 def test_what_the_kernels_skip_changes_no_bit(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But the work: pairs of a splat and a tile that are listed, and pairs of a splat and a pixel that are blended."""
+    """Skipping saves work: fewer pairs of splat and tile are listed, and fewer pairs of splat and pixel are blended."""
     monkeypatch.setenv(ISA_VARIABLE, isa)
     case = single(make_case(5, count=2000, width=67, height=35))
 

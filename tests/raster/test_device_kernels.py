@@ -1,4 +1,4 @@
-"""The kernels of a GPU, on a CPU: what holds for them beside `test_backends_agree.py` and `test_stress.py`."""
+"""The GPU's kernels run on a CPU here. `test_backends_agree.py` and `test_stress.py` test them too."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def single(case: Case) -> Case:
 
 
 def everything(engine: Backend, case: Case) -> list[Tensor]:
-    """All that a step computes, Adam's included."""
+    """All values that a step computes, those of Adam included."""
     drawn = engine.forward(case.gaussians, case.camera, case.settings, case.background, depth=True)
     gradients = engine.backward(drawn, *(v.float() for v in weights_like(case)), absgrad=True)
     loss = engine.photometric(drawn.colors, torch.full_like(drawn.colors, 0.3), 0.2)
@@ -93,7 +93,7 @@ def test_the_text_includes_every_file_once() -> None:
 
 @pytest.mark.parametrize(("stored", "drawn_degree"), [(3, 3), (3, 1), (2, 2), (1, 3), (0, 3)])
 def test_adam_needs_no_gradient_of_the_bands(stored: int, drawn_degree: int) -> None:
-    """The step that finds it from that of sh0 is the one that is given it, to the last bit."""
+    """Adam finds the gradient of the bands from that of sh0; the step equals one that is given it, to the last bit."""
     settings = RasterSettings(sh_degree=drawn_degree)
     case = single(make_case(6, count=77, width=40, height=36, settings=settings, sh_degree=stored))
     ends = []
@@ -111,7 +111,7 @@ def test_adam_needs_no_gradient_of_the_bands(stored: int, drawn_degree: int) -> 
 
 
 def test_an_image_of_more_tiles_than_a_short_holds() -> None:
-    """Their numbers are sorted as long ones then: the same pixels."""
+    """Tiles are numbered by 32 bits then; the pixels stay the same."""
     case = single(make_case(5, count=60, width=67, height=35))
     expected = everything(simt_backend(), case)
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""What no input view shows is marked, and nothing else."""
+"""Splats that no input view shows are marked, and no others."""
 
 from __future__ import annotations
 

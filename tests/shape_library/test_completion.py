@@ -1,4 +1,4 @@
-"""One photo, a library, and words: the body they make."""
+"""Tests of the body that one photo, a library, and words make."""
 
 from __future__ import annotations
 
