@@ -3,7 +3,8 @@
     python experiments/clean.py RUN... [--draw]
 
 For each finished run with held-out views, this prints how many splats go by each rule, and the PSNR of the held-out
-views before and after. Nothing is written into the runs. `--draw` rewrites the table of docs/howto/clean.md and results/clean.json.
+views before and after. Nothing is written into the runs. `--draw` rewrites the table of docs/howto/clean.md and
+results/clean.json.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The k-th change of the disk fails, for every k: killed, full, broken, half written. Nothing is missing after resuming.
+"""The k-th change of the disk fails, for every k: killed, full, broken, half written. Resuming loses nothing.
 
 An ordinary run of the tests takes a sample of the k; GSOPT_EVERY_WRITE=full takes every one (`make every-write`).
 """

@@ -78,7 +78,7 @@ def check_gradients(got: Gradients, expected: Gradients, floor: float) -> None:
 
 
 def both_gradients(backend: Backend, case: Case) -> tuple[Gradients, Gradients]:
-    """Gradients of the backend and of the float64 reference, once their images agree; undecided pixels have no weight."""
+    """Gradients of the backend and of the reference, once their images agree; undecided pixels have no weight."""
     decided = ~undecided_pixels(case, DECISION)
     expected, got = draw(ORACLE, case), draw(backend, single(case))
     check_images(got, expected, decided)
