@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MAX_THREADS = 1024
+UNITS = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}
 DEVICE = re.compile(r"(?:(cpu|cuda)(?::\d{1,3})?)?")
 
 
@@ -84,6 +85,18 @@ def within(name: str, value: float, low: float, high: float, remedy: str) -> Non
     """Raise UsageError unless `low` <= `value` <= `high` (NaN is refused)."""
     if not (low <= value <= high) or math.isnan(value):
         raise UsageError(f"`{name}` must lie in [{low}, {high}], got {value}. {remedy}")
+
+
+def byte_count(name: str, text: str) -> int:
+    """Bytes of a size as 8GB, 500MB or 8e9; UsageError for anything else."""
+    match = re.fullmatch(r"([0-9.]{1,12}(?:e[0-9]{1,2})?) *([kMGT]?B?)", text)
+    try:
+        size = float(match[1]) * UNITS[match[2].rstrip("B")] if match else 0.0
+    except ValueError:
+        size = 0.0
+    if not 1 <= size < 1e18:
+        raise UsageError(f"`{name}` must be a size as 8GB or 500MB, got {shortened(text)}. Give number and unit.")
+    return round(size)
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -12,7 +12,6 @@ Every object becomes a folder of `data` that `gsopt train` takes; docs/howto/syn
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -34,6 +33,7 @@ from synth.worker_pool import serve
 
 from gsopt import check
 from gsopt.errors import GsoptError, UsageError
+from gsopt.farm.open import available_cores, open_farm
 
 INTERRUPTED = 130
 
@@ -90,6 +90,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="turns the cameras, jitters the lens, seeds the noise")
     parser.add_argument("--workers", type=int, default=1, help="Blender processes; the files do not depend on it")
     setting("--threads", "per worker; 0: the cores, shared among the workers", type=int)
+    parser.add_argument("--farm", default="local", metavar="local|ray[://HOST:PORT]", help="where the workers run")
+    parser.add_argument("--memory-limit", metavar="8GB", help="memory that a worker may hold")
     parser.add_argument("--time-limit", type=float, default=3600.0, metavar="S", help="seconds an object may take")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --out")
     return parser
@@ -127,20 +129,19 @@ def parse(arguments: Sequence[str]) -> tuple[list[mesh_items.Item], Settings, di
     sources += [mesh_items.of_manifest(manifest)] if manifest else []
     limit = given.pop("limit")
     check.at_least("--limit", 1 if limit is None else limit, 1, "Drop the flag to render all.")
-    how = {name: given.pop(name) for name in ("seed", "out", "workers", "resume", "time_limit")}
+    how = {name: given.pop(name) for name in ("seed", "out", "resume", "time_limit")}
+    farm, workers, memory = (given.pop(name) for name in ("farm", "workers", "memory_limit"))
     check.within("--seed", how["seed"], 0, 2**31 - 1, "Any whole number from 0 on will do.")
-    check.within("--workers", how["workers"], 1, 1024, "One per core is a good start.")
+    check.within("--workers", workers, 1, 1024, "One per core is a good start.")
     check.at_least("--time-limit", how["time_limit"], 1.0, "Give seconds.")
     given["elevations"] = tuple(given["elevations"]) if given["elevations"] else None
     settings = Settings(**given)
     if not settings.threads:
-        settings = replace(settings, threads=max(1, available_cores() // how["workers"]))
+        settings = replace(settings, threads=max(1, available_cores() // workers))
+    how["memory_limit"] = check.byte_count("--memory-limit", memory) if memory else None
+    how["farm"] = open_farm(farm, workers * settings.threads)
     chosen = islice((item for source in sources for item in source), limit)
     return mesh_items.unique(chosen), settings, how
-
-
-def available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def stop(signum: int, frame: FrameType | None) -> None:

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.errors import InputError
+from gsopt.farm.job import PARTIAL, Farm, Outcome
+from gsopt.farm.local import LocalFarm
 from synth.cameras import shots
 from synth.export import write_json
 from synth.mesh_items import Item
-from synth.render_object import PARTIAL, RECORD
+from synth.render_object import RECORD
 from synth.settings import Settings
-from synth.worker_pool import Job, Outcome, run_jobs
+from synth.worker_pool import reason, render_job
 
 VERSION = 1
 DATASET, FAILURES, TIMINGS, LOG = "dataset.json", "failures.json", "timings.json", "log.txt"
@@ -31,30 +33,37 @@ def run(
     settings: Settings,
     seed: int,
     out: Path,
-    workers: int = 1,
+    farm: Farm | None = None,
     resume: bool = False,
     time_limit: float = 3600.0,
+    memory_limit: int | None = None,
 ) -> int:
     """Render every item into `out / item.id` and return the exit code: 0, or 3 when any failed.
 
-    With `resume`, objects that `out` already holds of the same run are kept. InputError when `out` holds
-    anything else, or when a file that the settings name cannot be read; nothing in `out` is touched then.
+    The files do not depend on `farm`; without one, a single worker renders. `memory_limit`: bytes of a worker. With
+    `resume`, objects that `out` already holds of the same run are kept. InputError when `out` holds anything else, or
+    when a file that the settings name cannot be read; nothing in `out` is touched then.
     """
     began = time.perf_counter()
     header = {"version": VERSION, "settings": settings.record(), "seed": seed, "files_sha256": files_used(settings)}
     open_folder(out, header, resume)
     todo = [item for item in items if not (out / item.id / RECORD).is_file()]
     failures = [failure for item in items if item not in todo for failure in changed(out, item)]
-    report(f"{len(items)} objects, {len(items) - len(todo)} of them rendered before, {workers} workers")
-    jobs = [Job(item, settings, object_seed(seed, item.id), out / item.id) for item in todo]
+    farm = farm or LocalFarm(max(1, settings.threads))
+    report(f"{len(items)} objects, {len(items) - len(todo)} of them rendered before; {farm}")
+    jobs = [
+        render_job(item, settings, object_seed(seed, item.id), out / item.id, time_limit, memory_limit) for item in todo
+    ]
     outcomes: list[Outcome] = []
     try:
         with (out / LOG).open("ab") as log:
-            for outcome in run_jobs(jobs, workers, log, time_limit):
+            for outcome in farm.run(jobs):
                 outcomes.append(outcome)
+                log.write(outcome.output.encode("utf-8", "replace"))
                 report(f"[{len(outcomes)}/{len(jobs)}] {line_about(outcome)}")
     finally:
-        failures += [failure(o.job.item, o.error) for o in outcomes if o.error]
+        known = {item.id: item for item in todo}
+        failures += [failure(known[o.job.name], reason(o)) for o in outcomes if o.ending != "done"]
         write_whole(out / FAILURES, sorted(failures, key=lambda f: str(f["id"])))
         write_whole(out / DATASET, header | {"objects": sorted(records(out), key=lambda r: str(r["id"]))})
         write_whole(out / TIMINGS, timings(outcomes, time.perf_counter() - began))
@@ -154,17 +163,17 @@ def records(out: Path) -> Iterator[dict[str, Any]]:
 
 def timings(outcomes: Sequence[Outcome], seconds: float) -> dict[str, Any]:
     """Returns the times of this invocation; dataset.json has none, so that equal runs write equal files."""
-    done = {o.job.item.id: o.seconds for o in outcomes if o.seconds is not None}
+    done = {o.job.name: o.answer for o in outcomes if o.ending == "done"}
     total = {stage: sum(s[stage] for s in done.values()) for stage in ("stage", "render", "write")}
     return {"wall_seconds": seconds, "objects": len(done), "seconds_in_workers": total, "by_object": done}
 
 
 def line_about(outcome: Outcome) -> str:
-    if outcome.seconds is None:
-        return f"{outcome.job.item.id}: {outcome.error}"
-    record = json.loads((outcome.job.out / RECORD).read_text(encoding="utf-8"))
+    if outcome.ending != "done" or outcome.job.folder is None:
+        return f"{outcome.job.name}: {reason(outcome)}"
+    record = json.loads((outcome.job.folder / RECORD).read_text(encoding="utf-8"))
     warnings = "".join(f"; {warning}" for warning in record.get("warnings", []))
-    return f"{outcome.job.item.id}: {sum(outcome.seconds.values()):.1f} s{warnings}"
+    return f"{outcome.job.name}: {sum(outcome.answer.values()):.1f} s{warnings}"
 
 
 def write_whole(path: Path, content: Any) -> None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsopt.errors import InputError, MissingDependency, UsageError
+from gsopt.farm.job import PARTIAL
 from synth import captions, lighting_and_render, pixels
 from synth.cameras import Shot, shots
 from synth.export import export, write_json
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8
 
 RECORD = "object.json"
-PARTIAL = ".partial-"
-"""Prefix of a folder that is being written."""
 NOTHING = 1e9
 """Blender's depth where no surface is seen lies above this."""
 

@@ -330,11 +330,11 @@ def test_a_killed_run_resumes_to_the_same_files(bpy: Any, two_balls: Path, tmp_p
 
     killed = subprocess.Popen(command("killed", "--workers", "2"), stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not list(tmp_path.glob(f"killed/*/{RECORD}")) and time.monotonic() < deadline:
+    while not list(tmp_path.glob(f"killed/[!.]*/{RECORD}")) and time.monotonic() < deadline:
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
-    kept = {p: p.stat().st_mtime_ns for p in tmp_path.glob(f"killed/*/{RECORD}")}
+    kept = {p: p.stat().st_mtime_ns for p in tmp_path.glob(f"killed/[!.]*/{RECORD}")}
     assert kept
     time.sleep(1.0)  # the workers notice that the run is gone
     resumed = subprocess.run(command("killed", "--resume"), check=False, capture_output=True, text=True)

@@ -18,35 +18,38 @@ from synth.mesh_items import Item
 from synth.render_dataset import run
 from synth.render_object import PARTIAL, RECORD, new_folder
 from synth.settings import Settings
-from synth.worker_pool import Job, from_json, to_json
+from synth.worker_pool import read_request, render_job
 
 from gsopt.errors import InputError, UsageError
+from gsopt.farm.local import LocalFarm
 
-SETTINGS = Settings(views=1, resolution=(8, 8), formats=("nerf", "colmap"), elevations=(0.0, 10.0))
+SETTINGS = Settings(threads=1, views=1, resolution=(8, 8), formats=("nerf", "colmap"), elevations=(0.0, 10.0))
 
 PRETENDER = """
     import json, os, sys, time
     sys.path[:0] = {paths!r}
-    from synth.worker_pool import ANSWER, from_json
+    from gsopt.errors import InputError
+    from gsopt.farm.serve import serve
+    from synth.worker_pool import read_request
     print("Blender talks", flush=True)
-    for line in sys.stdin:
-        job = from_json(line)
+    def handle(request):
+        item, settings, seed, out = read_request(request)
         with open({calls!r}, "a") as calls:
-            calls.write(job.item.id + "\\n")
-        text = job.item.mesh.read_text()
+            calls.write(item.id + "\\n")
+        text = item.mesh.read_text()
         if text == "crash":
             os._exit(11)
         if text == "hang":
             time.sleep(600)
         if text == "bad":
-            print(ANSWER + json.dumps({{"error": "it is bad. Mend it."}}), flush=True)
-            continue
-        job.out.mkdir(parents=True)
+            raise InputError("it is bad. Mend it.")
+        out.mkdir(parents=True)
         sha = __import__("hashlib").sha256(text.encode()).hexdigest()
-        record = {{"id": job.item.id, "seed": job.seed, "mesh_sha256": sha}}
+        record = {{"id": item.id, "seed": seed, "mesh_sha256": sha}}
         record["warnings"] = ["no texture"] if text == "lost" else []
-        (job.out / "object.json").write_text(json.dumps(record))
-        print(ANSWER + json.dumps({{"seconds": {{"stage": 0.0, "render": 0.0, "write": 0.0}}}}), flush=True)
+        (out / "object.json").write_text(json.dumps(record))
+        return {{"stage": 0.0, "render": 0.0, "write": 0.0}}
+    serve(handle)
 """
 
 
@@ -57,7 +60,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     calls.touch()
     paths = [str(worker_pool.SCRIPT.parent), str(worker_pool.SCRIPT.parent.parent)]
     script.write_text(textwrap.dedent(PRETENDER.format(paths=paths, calls=str(calls))))
-    monkeypatch.setattr(worker_pool, "worker_command", lambda: [sys.executable, str(script)])
+    monkeypatch.setattr(worker_pool, "worker_command", lambda: (sys.executable, str(script)))
     return calls
 
 
@@ -73,7 +76,7 @@ def read(path: Path) -> Any:
 
 def test_one_bad_mesh_never_stops_the_run(calls: Path, tmp_path: Path) -> None:
     items = meshes(tmp_path, a="x", b="bad", c="crash", d="y")
-    assert run(items, SETTINGS, 0, tmp_path / "out", workers=2) == 3
+    assert run(items, SETTINGS, 0, tmp_path / "out", LocalFarm(2)) == 3
     failures = {f["id"]: f["reason"] for f in read(tmp_path / "out" / "failures.json")}
     assert list(failures) == ["b", "c"]
     assert "it is bad" in failures["b"]
@@ -82,13 +85,11 @@ def test_one_bad_mesh_never_stops_the_run(calls: Path, tmp_path: Path) -> None:
 
 
 def test_a_mesh_that_takes_too_long_costs_no_other(calls: Path, tmp_path: Path) -> None:
-    jobs = [Job(i, SETTINGS, 0, tmp_path / "out" / i.id) for i in meshes(tmp_path, a="hang", b="x")]
-    with (tmp_path / "log").open("wb") as log:
-        worker = worker_pool.Worker(log, time_limit=1.0)
-        assert "longer than 1 s" in str(worker.do(jobs[0]).error)
-        worker.time_limit = 600.0
-        assert worker.do(jobs[1]).error is None
-        worker.end()
+    items = meshes(tmp_path, a="hang", b="x")
+    assert run(items, SETTINGS, 0, tmp_path / "out", time_limit=2.0) == 3
+    (lost,) = read(tmp_path / "out" / "failures.json")
+    assert (lost["id"], "longer than 2 s" in lost["reason"]) == ("a", True)
+    assert (tmp_path / "out" / "b" / RECORD).is_file()
 
 
 def test_resume_renders_nothing_twice_and_tries_failures_again(calls: Path, tmp_path: Path) -> None:
@@ -116,7 +117,7 @@ def test_a_changed_mesh_is_told_and_its_views_are_kept(calls: Path, tmp_path: Pa
 def test_what_is_recorded_does_not_depend_on_the_workers(calls: Path, tmp_path: Path) -> None:
     items = meshes(tmp_path, **{f"m{i}": str(i) for i in range(6)})
     for workers in (1, 3):
-        run(items, SETTINGS, 4, tmp_path / str(workers), workers=workers)
+        run(items, SETTINGS, 4, tmp_path / str(workers), LocalFarm(workers))
     first, second = ((tmp_path / w / "dataset.json").read_bytes() for w in ("1", "3"))
     assert first == second
     assert len({o["seed"] for o in json.loads(first)["objects"]}) == 6
@@ -215,10 +216,10 @@ def test_nothing_in_the_way_is_replaced(blocker: str, tmp_path: Path) -> None:
     assert out.is_symlink() or out.read_text() == "mine"
 
 
-def test_a_job_survives_the_pipe() -> None:
-    job = Job(Item("стул 3", Path("/m/ü x.obj"), front=(0.0, 1.0)), SETTINGS, 5, Path("out/стул 3"))
-    assert from_json(to_json(job)) == job
-    assert to_json(job).isascii()
+def test_an_object_survives_the_pipe() -> None:
+    item = Item("стул 3", Path("/m/ü x.obj"), front=(0.0, 1.0))
+    job = render_job(item, SETTINGS, 5, Path("/out/стул 3"), 60.0, None)
+    assert read_request(json.loads(json.dumps(job.request))) == (item, SETTINGS, 5, Path("/out/стул 3"))
 
 
 # The command line
@@ -235,11 +236,12 @@ def test_command_line_reaches_the_settings(tmp_path: Path) -> None:
         "a.obj -o out --views 3 --test-views 2 --val-views 1 --resolution 320x200 --fov 30 --layout orbit "
         "--elevations 0 10 --radius 5 --lens-jitter 0.1 --samples 4 --lighting hdri sky.exr --background #102030 "
         "--normalize cube --depth --normals --masks --position --format nerf,colmap --points 10 --captions --preview "
-        "--threads 3 --seed 4 --workers 2 --time-limit 60 --resume b.obj"
+        "--threads 3 --seed 4 --workers 2 --time-limit 60 --memory-limit 2GB --resume b.obj"
     )
     found, settings, how = synth_views.parse(line.split())
     assert [item.id for item in found] == ["a", "b"]
-    assert how == {"seed": 4, "out": Path("out"), "workers": 2, "resume": True, "time_limit": 60.0}
+    assert str(how.pop("farm")) == "this machine, 6 cores"
+    assert how == {"seed": 4, "out": Path("out"), "resume": True, "time_limit": 60.0, "memory_limit": 2_000_000_000}
     assert settings == Settings(
         views=3, test_views=2, val_views=1, resolution=(320, 200), fov=30.0, layout="orbit", elevations=(0.0, 10.0),
         radius=5.0, lens_jitter=0.1, samples=4, lighting="hdri", hdri="sky.exr", background="#102030",
@@ -263,7 +265,7 @@ def test_a_limit_takes_the_first_objects(tmp_path: Path) -> None:
     assert [item.id for item in found] == ["a", "b"]
 
 
-@pytest.mark.parametrize("wrong", ["--limit 0", "--workers 0", "--seed -1", "--synsets 1", "--time-limit nan"])
+@pytest.mark.parametrize("wrong", ["--limit 0", "--workers 0", "--seed -1", "--synsets 1", "--time-limit nan", "--memory-limit much", "--farm slurm"])
 def test_wrong_numbers_are_usage_errors(wrong: str) -> None:
     with pytest.raises(UsageError):
         synth_views.parse(["a.obj", "-o", "out", *wrong.split()])

@@ -1,0 +1,28 @@
+"""`--farm`: a farm by its name."""
+
+from __future__ import annotations
+
+import os
+
+from gsopt import check
+from gsopt.errors import UsageError
+from gsopt.farm.job import Farm
+from gsopt.farm.local import LocalFarm
+
+MAX_CPUS = 1024
+HELP = "local[:CORES], or ray[://HOST:PORT]: this machine, or a Ray cluster (pip install 'gsopt[ray]')."
+
+
+def open_farm(name: str, cpus: int, memory: int | None = None) -> Farm:
+    """The farm of `--farm NAME`; a bare `local` has `cpus` cores. Raises UsageError for another name."""
+    kind, _, rest = name.partition(":")
+    if kind == "local" and (not rest or rest.isdecimal()):
+        count = int(rest[:6]) if rest else cpus
+        check.within("--farm", count, 1, MAX_CPUS, "Give the cores to use, as local:4.")
+        return LocalFarm(count, memory)
+    raise UsageError(f"`--farm` must be local, local:CORES, ray or ray://HOST:PORT, got {name!r}. Pick one of these.")
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
