@@ -93,6 +93,8 @@ class Suite:
     """Parts of the suite, in its own order; all when not given."""
     threads: int = 1
     """Threads of every run. The figures do not depend on it."""
+    farm: Annotated[str, arg(metavar="local[:CORES]|ray[://HOST:PORT]")] = "local"
+    """Where the runs go; one after the other on this machine when not given."""
     prior: Annotated[str, arg(metavar="PRIOR")] = ""
     """Guides the guided arms, as `gsopt train --prior`; gsopt's own choice when not given."""
     llm: Annotated[str, arg(metavar="URL")] = ""
@@ -230,7 +232,9 @@ def suite(flags: Suite) -> int:
     check.within("--threads", flags.threads, 1, 256, "The figures do not depend on it.")
 
     from gsopt.benchmark.suite import definition as declared
+    from gsopt.farm.open import open_farm
 
+    farm = open_farm(flags.farm, flags.threads)
     whole = declared.load(flags.suite)
     part = declared.with_groups(whole, flags.groups)
     cases = list(declared.cases(part, flags.seeds, flags.arms))
@@ -246,7 +250,7 @@ def suite(flags: Suite) -> int:
     prior = str(folder.absolute()) if flags.prior and folder.is_dir() else flags.prior
     options = SuiteContext(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
     command = suite_command(flags)
-    failed = run_suite(output, whole, command, cases, options, lambda text: print(text, flush=True))
+    failed = run_suite(output, whole, command, cases, options, lambda text: print(text, flush=True), farm)
     drawn = output.with_suffix(".html")
     write_html(result_file.read(output), result_file.read_images(output), drawn)
     print(f"Written: {output}, {drawn}")

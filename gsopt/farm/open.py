@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 from gsopt import check
 from gsopt.errors import UsageError
@@ -10,14 +11,13 @@ from gsopt.farm.job import Farm
 from gsopt.farm.local import LocalFarm
 
 MAX_CPUS = 1024
-HELP = "local[:CORES], or ray[://HOST:PORT]: this machine, or a Ray cluster (pip install 'gsopt[ray]')."
 
 
 def open_farm(name: str, cpus: int, memory: int | None = None) -> Farm:
     """The farm of `--farm NAME`; a bare `local` has `cpus` cores. Raises UsageError for another name."""
-    kind, _, rest = name.partition(":")
-    if kind == "local" and (not rest or rest.isdecimal()):
-        count = int(rest[:6]) if rest else cpus
+    match = re.fullmatch(r"local(?::(\d{1,6}))?", name)
+    if match:
+        count = int(match[1] or cpus)
         check.within("--farm", count, 1, MAX_CPUS, "Give the cores to use, as local:4.")
         return LocalFarm(count, memory)
     raise UsageError(f"`--farm` must be local, local:CORES, ray or ray://HOST:PORT, got {name!r}. Pick one of these.")

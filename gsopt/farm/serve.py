@@ -1,7 +1,7 @@
 """The far end of a worker: reads a request a line from standard input, answers a line on standard output.
 
 Whatever else the process prints goes to standard error. It ends when its input ends, in the middle of a job if need be:
-a worker never outlives the process that started it.
+neither a worker nor its children outlive the process that started it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import queue
+import signal
 import sys
 import threading
 import traceback
@@ -44,4 +45,6 @@ def _receive(requests: queue.SimpleQueue[dict[str, Any]]) -> None:
     with contextlib.suppress(ValueError):
         for line in sys.stdin:
             requests.put(json.loads(line))
+    if hasattr(os, "killpg") and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)  # this process and its children
     os._exit(0)

@@ -8,6 +8,7 @@ import os
 import platform
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -23,6 +24,11 @@ OUTPUT_BYTES = 1 << 16
 """End of a worker's output that an outcome holds."""
 ERROR_LINES = 12
 """Last lines of the output of a worker that died, in its error."""
+
+
+def serving(module: str) -> tuple[str, ...]:
+    """The command of a worker that a module of gsopt is."""
+    return (sys.executable, "-m", module)
 
 
 class Worker:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +22,7 @@ from gsopt import cli
 from gsopt.benchmark.suite import definition, result_file, run_figures, run_key, runner, single_run
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.data.scene import load_scene
+from gsopt.farm.job import Job, Outcome
 from gsopt.geometry import quats
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
@@ -56,19 +57,34 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Ids of the executed runs, in order: a record with the case's name replaces training."""
     ids: list[str] = []
 
-    def measure(case: definition.Case, context: SuiteContext) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    def answer(request: dict[str, Any]) -> dict[str, Any]:
+        case = definition.Case(**request["case"])
         ids.append(case.id)
-        named = {**record(case.arm, 20.0, case.scene, case.seed), "key": single_run.key(case, context)}
-        return named, "protocol", {case.id: {"render": "r"}}
+        named = {**record(case.arm, 20.0, case.scene, case.seed), "key": request["key"]}
+        return {"record": named, "protocol": "protocol", "images": {case.id: {"render": "r"}}, "machine": MACHINE}
 
-    monkeypatch.setattr(single_run, "measure", measure)
-    monkeypatch.setattr(runner, "machine", lambda: MACHINE)
+    monkeypatch.setattr(single_run, "answer", answer)
     return ids
+
+
+class InThisProcess:
+    """A farm without processes."""
+
+    def run(self, jobs: list[Job], report: Any = None) -> Iterator[Outcome]:
+        for job in jobs:
+            try:
+                yield Outcome(job, "done", single_run.answer(job.request))
+            except RunFailed as error:
+                yield Outcome(job, "failed", error=str(error))
+
+    def cancel(self, name: str) -> None:
+        raise NotImplementedError
 
 
 def go(tmp_path: Path, context: SuiteContext, cases: list[definition.Case] = CASES) -> list[str]:
     run_key.folder_hash.cache_clear()
-    return runner.run_suite(tmp_path / "r.json", definition.load("sparse"), "c", cases, context, lambda text: None)
+    suite = definition.load("sparse")
+    return runner.run_suite(tmp_path / "r.json", suite, "c", cases, context, lambda text: None, InThisProcess())
 
 
 def test_nothing_is_made_twice(tmp_path: Path, context: SuiteContext, made: list[str]) -> None:
@@ -99,13 +115,13 @@ def test_what_changed_is_made_again_and_replaces_its_record(
     assert len(result_file.read(tmp_path / "r.json")["runs"]) == 4
 
 
-@pytest.mark.parametrize("stage", ["measure", "write", "write_images", "replace"])
+@pytest.mark.parametrize("stage", ["answer", "write", "write_images", "replace"])
 @pytest.mark.parametrize("number", [0, 2])
 def test_a_kill_loses_at_most_the_run_being_made(
     tmp_path: Path, context: SuiteContext, made: list[str], stage: str, number: int
 ) -> None:
     """Killed in a run, before or while its record is written, before its pictures are."""
-    owner: Any = {"measure": single_run, "write": result_file, "write_images": result_file, "replace": None}[stage]
+    owner: Any = {"answer": single_run, "write": result_file, "write_images": result_file, "replace": None}[stage]
     with pytest.MonkeyPatch.context() as patch:
         if owner is None:
             patch.setattr("os.replace", after(number * 2, shutil.move))  # pictures, then the record
@@ -139,17 +155,17 @@ def after(count: int, real: Callable[..., Any]) -> Callable[..., Any]:
 def test_a_run_that_fails_is_reported_and_the_others_are_made(
     tmp_path: Path, context: SuiteContext, made: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = single_run.measure
+    real = single_run.answer
 
-    def measure(case: definition.Case, context: SuiteContext) -> Any:
-        if case is CASES[1]:
+    def answer(request: dict[str, Any]) -> Any:
+        if definition.Case(**request["case"]) == replace(CASES[1], flags=request["case"]["flags"]):
             raise RunFailed("`x` ended with exit code 4. Mend that.")
-        return real(case, context)
+        return real(request)
 
-    monkeypatch.setattr(single_run, "measure", measure)
+    monkeypatch.setattr(single_run, "answer", answer)
     assert go(tmp_path, context) == [CASES[1].id]
     assert len(made) == 3
-    monkeypatch.setattr(single_run, "measure", real)
+    monkeypatch.setattr(single_run, "answer", real)
     assert go(tmp_path, context) == []
     assert made[3:] == [CASES[1].id]
 
@@ -164,10 +180,9 @@ def test_a_record_outlives_a_machine_that_cannot_make_it(
     assert (tmp_path / "r.json").read_bytes() == before
 
 
-def test_training_that_fails_says_why(tmp_path: Path, context: SuiteContext) -> None:
-    context.work.mkdir()
+def test_training_that_fails_says_why(tmp_path: Path) -> None:
     with pytest.raises(RunFailed, match=r"exit code 2: .*--iterations.*at least 1, got 0"):
-        single_run.call(["train", "x", "-m", str(tmp_path / "run"), "--iterations", "0"], tmp_path / "log")
+        single_run.call(["train", "x", "-m", str(tmp_path / "run"), "--iterations", "0"])
 
 
 # Figures beside metrics.json
@@ -178,7 +193,7 @@ def test_prompts_are_made_again_for_another_model_and_a_template_lies_beside_the
 ) -> None:
     asked: list[list[str]] = []
 
-    def call(arguments: list[str], log: Path) -> None:
+    def call(arguments: list[str]) -> None:
         asked.append(arguments)
         write_set(Path(arguments[arguments.index("-o") + 1]), PromptSet((Prompt("a cup", source="llm:m"),)))
 
@@ -300,7 +315,8 @@ def test_the_published_layout_is_trained_and_evaluated_on_every_eighth_image(tmp
     case = replace(case, iterations=10, flags=(*case.flags, "--iterations", "10"))
     context = SuiteContext(tmp_path / "root", tmp_path / "work", 1)
     context.work.mkdir()
-    made, protocol, _ = single_run.measure(case, context)
+    found = single_run.answer(single_run.run_job(case, context, "k").request)
+    made, protocol = found["record"], found["protocol"]
     assert made["views_in"] == 8
     assert made["views_out"] == ["images/00000.jpg", "images/00008.jpg"]
     assert made["per_view"]["mask_iou"] == [None, None]

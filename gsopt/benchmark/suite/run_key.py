@@ -21,8 +21,9 @@ PRESENTATION_FILES = (
     "benchmark/suite/tables.py",
     "benchmark/suite/html_page.py",
     "benchmark/suite/aggregate.py",
+    "farm/",
 )
-"""Files that only present results: a better table is no reason to measure again."""
+"""Files that present results or say where runs are made: a better table is no reason to measure again."""
 KEY_DIGITS = 16
 READ_BYTES = 1 << 20
 

@@ -1,4 +1,4 @@
-"""Executes the runs of a suite that have no record yet, one after the other, and writes the file after each."""
+"""Has a farm execute the runs of a suite that have no record yet, and writes the file after each."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from gsopt.benchmark.machine import machine
 from gsopt.benchmark.suite import result_file, single_run
 from gsopt.benchmark.suite.definition import Case, Suite
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.events import Report
+from gsopt.farm.job import Farm, Job
+from gsopt.farm.local import LocalFarm
 
 
 def work_folder(path: Path) -> Path:
@@ -22,11 +21,18 @@ def work_folder(path: Path) -> Path:
 
 
 def run_suite(
-    path: Path, suite: Suite, command: str, cases: Sequence[Case], context: SuiteContext, report: Report
+    path: Path,
+    suite: Suite,
+    command: str,
+    cases: Sequence[Case],
+    context: SuiteContext,
+    report: Report,
+    farm: Farm | None = None,
 ) -> list[str]:
-    """Brings the result file up to date with `cases` and returns the failed ones. A kill loses only the current run.
+    """Brings the result file up to date with `cases` and returns the failed ones. A kill loses only the current runs.
 
-    Raises UsageError and InputError for a file of another suite or a broken one, before anything is run.
+    Without a farm, one run follows the other on this machine. Only this process writes the file. Raises UsageError and
+    InputError for a file of another suite or a broken one, before anything is run.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with result_file.locked(path):
@@ -34,37 +40,51 @@ def run_suite(
         context.work.mkdir(parents=True, exist_ok=True)
         for stale in context.work.glob("run-*"):  # of a killed call
             shutil.rmtree(stale, ignore_errors=True)
-        torch.set_num_threads(1)
         failed: list[str] = []
-        for number, case in enumerate(cases, 1):
-            document, message = _one(path, document, case, context)
-            if message:
-                report(f"{number}/{len(cases)} {message}")
-            failed += [case.id] if " failed: " in message else []
+        jobs: list[Job] = []
+        for case in cases:
+            try:
+                document, job = _prepared(path, document, case, context)
+            except RunFailed as error:
+                report(f"{case.id} failed: {error}")
+                failed.append(case.id)
+            else:
+                jobs += [job] if job else []
+        for number, outcome in enumerate((farm or LocalFarm(context.threads)).run(jobs), 1):
+            if outcome.ending == "done":
+                document = _written(path, document, outcome.answer)
+                message = line(outcome.answer["record"])
+            else:
+                message = f"{outcome.job.name} failed: {outcome.error}"
+                failed.append(outcome.job.name)
+            report(f"{number}/{len(jobs)} {message}")
         return failed
 
 
-def _one(path: Path, document: dict[str, Any], case: Case, context: SuiteContext) -> tuple[dict[str, Any], str]:
-    """(document after one case, written when it changed; line to print)."""
-    message, old = "", next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
+def _prepared(
+    path: Path, document: dict[str, Any], case: Case, context: SuiteContext
+) -> tuple[dict[str, Any], Job | None]:
+    """(document, written when the case is skipped; the job of a run that has no record yet)."""
+    old = next((run for run in document["runs"] if result_file.run_id(run) == case.id), None)
     if (reason := single_run.reason_to_skip(case, context)) is not None:
         skip = {**case.fields, "reason": reason}
-        if old is not None or skip in document["skipped"]:  # keep a record made on a machine that had a prior
-            return document, ""
-        document = result_file.with_skip(document, skip)
-    else:
-        try:
-            if old is not None and old["key"] == single_run.key(case, context):
-                return document, ""
-            record, protocol, images = single_run.measure(case, context)
-        except RunFailed as error:
-            return document, f"{case.id} failed: {error}"
-        document = result_file.with_run(document, record, machine(), protocol)
-        if images:
-            result_file.write_images(path, {**result_file.read_images(path), **images})
-        message = line(record)
+        if old is None and skip not in document["skipped"]:  # else keep a record made on a machine that had a prior
+            document = result_file.with_skip(document, skip)
+            result_file.write(path, document)
+        return document, None
+    run_hash = single_run.key(case, context)
+    if old is not None and old["key"] == run_hash:
+        return document, None
+    return document, single_run.run_job(case, context, run_hash)
+
+
+def _written(path: Path, document: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
+    """The document with a finished run, on the disk; its images first."""
+    if answer["images"]:
+        result_file.write_images(path, {**result_file.read_images(path), **answer["images"]})
+    document = result_file.with_run(document, answer["record"], answer["machine"], answer["protocol"])
     result_file.write(path, document)
-    return document, message
+    return document
 
 
 def line(record: dict[str, Any]) -> str:

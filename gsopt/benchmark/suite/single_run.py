@@ -1,19 +1,19 @@
-"""One run of a suite: `gsopt train` in a process of its own, and all its figures as one record."""
+"""One run of a suite: a job of a farm, which trains in a process of its own and returns all figures as one record."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from gsopt.benchmark.machine import machine
 from gsopt.benchmark.suite import arm_flags, run_key
 from gsopt.benchmark.suite.definition import EVALUATIONS, Case
 from gsopt.benchmark.suite.result_file import METRICS
@@ -22,12 +22,16 @@ from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.errors import GsoptError, InputError
 from gsopt.events import read_events
+from gsopt.farm.job import Job
+from gsopt.farm.worker import Worker, serving
 from gsopt.metrics import find_vgg_weights
+from gsopt.raster.cpu_backend import ISA_VARIABLE, workspace
 from gsopt.results.evaluation import read_metrics
 from gsopt.results.finished_run import open_run
 from gsopt.sds.prompts import read_set, write_prompts
 from gsopt.sds.select_prior import EMBEDDED, embedded_prior_obstacle
 
+ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
 MAX_ERROR_LINES = 12
 """Number of last lines of a failed run's output in its error."""
 
@@ -131,7 +135,7 @@ def prompts(case: Case, context: SuiteContext) -> Path | None:
     command = ["prompts", "--notes", str(note["notes"]), "--domain", domain]
     command += ["--category", str(note["category"])] if "category" in note else []
     command += ["--llm", context.llm, "--model", context.model] if case.arm == "ours-llm" else []
-    call([*command, "-o", str(every), "--overwrite"], path.with_suffix(".log"))
+    call([*command, "-o", str(every), "--overwrite"])
     found = read_set(every).prompts
     write_prompts(path, [prompt for prompt in found if prompt.source.startswith(arm_flags.PROMPT_SOURCES[case.arm])])
     return path
@@ -147,42 +151,50 @@ def machine_flags(case: Case, context: SuiteContext) -> list[str]:
     return flags if path is None else [*flags, "--prompts", str(path)]
 
 
-def call(arguments: list[str], log: Path) -> None:
-    """`gsopt ARGUMENTS` with this Python and this package; RunFailed with the end of its output."""
-    with open(log, "wb") as output:
-        done = subprocess.run(
-            [sys.executable, "-m", "gsopt", *arguments],
-            cwd=run_key.PACKAGE.parent,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            check=False,
-        )
-    if done.returncode in (-signal.SIGINT, -signal.SIGTERM, 130):
-        raise KeyboardInterrupt
-    if done.returncode:
-        last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-MAX_ERROR_LINES:]
+def call(arguments: list[str]) -> None:
+    """`gsopt ARGUMENTS` in a process of its own; RunFailed with the end of its output."""
+    job = Job("gsopt", serving("gsopt.cli.serve_jobs"), {"arguments": arguments}, environment=ENVIRONMENT)
+    worker = Worker()
+    try:
+        outcome = worker.do(job, job.request)
+    finally:
+        worker.end()
+    if outcome.ending != "done" or outcome.answer:
+        last = " / ".join(outcome.output.splitlines()[-MAX_ERROR_LINES:])
         raise RunFailed(
-            f"`gsopt {' '.join(arguments)}` ended with exit code {done.returncode}: {' / '.join(last)}. "
+            f"`gsopt {' '.join(arguments)}` ended with {outcome.error or f'exit code {outcome.answer}'}: {last}. "
             "Correct that and run the suite again: it executes only missing runs."
         )
 
 
-def measure(case: Case, context: SuiteContext) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    """Trains and evaluates: (record as in `result_file.RUN` without references, protocol, images of seed 0)."""
-    folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.work))
+def run_job(case: Case, context: SuiteContext, run_hash: str) -> Job:
+    """The run as a job of a farm; its answer is that of `answer`."""
+    flags = machine_flags(case, context)
+    request = {"case": asdict(case), "key": run_hash, "root": str(context.root), "work": str(context.work)}
+    request |= {"threads": context.threads, "flags": flags}
+    inputs = [context.root / case.scene, *(path for word in flags if (path := Path(word)).is_absolute())]
+    environment = {**ENVIRONMENT, ISA_VARIABLE: workspace(1).isa}
+    command = serving("gsopt.benchmark.suite.worker")
+    return Job(case.id, command, request, inputs=tuple(inputs), cpus=context.threads, environment=environment)
+
+
+def answer(request: Mapping[str, Any]) -> dict[str, Any]:
+    """Executes a request of `run_job`: trains, evaluates, and returns the figures with the machine they come from."""
+    case = Case(**{**request["case"], "flags": tuple(request["case"]["flags"])})
+    root, work = Path(request["root"]), Path(request["work"])
+    torch.set_num_threads(1)
+    folder = Path(tempfile.mkdtemp(prefix="run-", dir=work if work.is_dir() else None))
     try:
         run = folder / "run"
-        data = str(context.root / case.scene)
-        call(["train", data, "-m", str(run), *case.flags, *machine_flags(case, context)], folder / "output.txt")
-        return recorded(case, context, run)
+        call(["train", str(root / case.scene), "-m", str(run), *case.flags, *request["flags"]])
+        record, protocol, images = recorded(case, run, request["key"], request["threads"])
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+    return {"record": record, "protocol": protocol, "images": images, "machine": machine()}
 
 
-def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, Any], str, dict[str, Any]]:
-    """Every figure of a finished run."""
+def recorded(case: Case, run: Path, run_hash: str, threads: int) -> tuple[dict[str, Any], str, dict[str, Any]]:
+    """Figures of a finished run: (record as in `result_file.RUN` without references, protocol, images of seed 0)."""
     from gsopt.benchmark.suite import run_figures
 
     metrics, events = read_metrics(run), read_events(run / "events.jsonl")[0]
@@ -190,7 +202,7 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
         raise RunFailed(f"{case.id} must end with `done`, got {events[-1]['kind']!r}. Run the suite again.")
     if not metrics.get("per_view"):
         raise InputError(f"{case.scene} holds out no views, so nothing can be evaluated. Add --eval to its group.")
-    finished = open_run(run, threads=context.threads)
+    finished = open_run(run, threads=threads)
     scene = load_scene(finished.config.data)
     started = next(event for event in events if event["kind"] == "started")
     setup = float(started.get("setup_cpu_seconds", 0.0))
@@ -198,7 +210,7 @@ def recorded(case: Case, context: SuiteContext, run: Path) -> tuple[dict[str, An
     per_view |= run_figures.shape(finished, scene)
     record = {
         **case.fields,
-        "key": key(case, context),
+        "key": run_hash,
         "flags": list(case.flags),
         "views_in": len(scene.train),
         "views_out": [row["name"] for row in metrics["per_view"]],
