@@ -25,7 +25,7 @@ class Job:
     command: tuple[str, ...]
     """Starts a worker: a program that calls `gsopt.farm.serve.serve`."""
     request: Mapping[str, Any]
-    """JSON-ready. Where a job runs without the driver's disk, its paths at and below `inputs` and `folder` are replaced."""
+    """JSON-ready. Where the driver's disk is not seen, its paths at and below `inputs` and `folder` are replaced."""
     folder: Path | None = None
     """New folder that the worker makes; it appears whole or not at all. None for a job whose answer is its result."""
     inputs: tuple[Path, ...] = ()

@@ -84,7 +84,9 @@ class LocalFarm:
             self._changed.wait_for(lambda: self._fits(job) or self._is_canceled(job))
             self._free -= job.cpus
             self._free_memory -= job.memory or 0
-            worker = next((worker for worker in self._idle if worker.fits(job)), None) or next(iter(self._idle), Worker())
+            worker = next((worker for worker in self._idle if worker.fits(job)), None) or next(
+                iter(self._idle), Worker()
+            )
             if worker in self._idle:
                 self._idle.remove(worker)
         try:

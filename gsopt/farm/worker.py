@@ -48,8 +48,8 @@ class Worker:
         began, since = time.monotonic(), os.fstat(self._output.fileno()).st_size
         try:
             self._start(job)
-        except OSError as error:
-            return Outcome(job, "died", error=f"Cannot start {job.command[0]}: {error.strerror}.")
+        except OSError as refusal:
+            return Outcome(job, "died", error=f"Cannot start {job.command[0]}: {refusal.strerror}.")
         assert self.process is not None
         with _watched(self.process, job, canceled) as watch:
             reply = self._reply(json.dumps(request))

@@ -76,7 +76,9 @@ def test_a_job_beyond_its_time_is_ended_with_its_children(tmp_path: Path) -> Non
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is watched where /proc reports it")
 def test_a_job_beyond_its_memory_is_ended() -> None:
-    found = by_name(LocalFarm(1), job("a", "leak", memory=150 * MEGABYTE, seconds=60.0), job("b", memory=150 * MEGABYTE))
+    found = by_name(
+        LocalFarm(1), job("a", "leak", memory=150 * MEGABYTE, seconds=60.0), job("b", memory=150 * MEGABYTE)
+    )
     assert (found["a"].ending, found["b"].ending) == ("memory", "done")
     assert found["a"].error == "It held more than 157 MB of memory."
     assert found["a"].peak_memory > 150 * MEGABYTE

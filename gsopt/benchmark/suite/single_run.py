@@ -170,8 +170,14 @@ def call(arguments: list[str]) -> None:
 def run_job(case: Case, context: SuiteContext, run_hash: str) -> Job:
     """The run as a job of a farm; its answer is that of `answer`."""
     flags = machine_flags(case, context)
-    request = {"case": asdict(case), "key": run_hash, "root": str(context.root), "work": str(context.work)}
-    request |= {"threads": context.threads, "flags": flags}
+    request = {
+        "case": asdict(case),
+        "key": run_hash,
+        "root": str(context.root),
+        "work": str(context.work),
+        "threads": context.threads,
+        "flags": flags,
+    }
     inputs = [context.root / case.scene, *(path for word in flags if (path := Path(word)).is_absolute())]
     environment = {**ENVIRONMENT, ISA_VARIABLE: workspace(1).isa}
     command = serving("gsopt.benchmark.suite.worker")

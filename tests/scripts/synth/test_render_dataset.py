@@ -265,7 +265,10 @@ def test_a_limit_takes_the_first_objects(tmp_path: Path) -> None:
     assert [item.id for item in found] == ["a", "b"]
 
 
-@pytest.mark.parametrize("wrong", ["--limit 0", "--workers 0", "--seed -1", "--synsets 1", "--time-limit nan", "--memory-limit much", "--farm slurm"])
+@pytest.mark.parametrize(
+    "wrong",
+    ["--limit 0", "--workers 0", "--seed -1", "--synsets 1", "--time-limit nan", "--memory-limit much", "--farm slurm"],
+)
 def test_wrong_numbers_are_usage_errors(wrong: str) -> None:
     with pytest.raises(UsageError):
         synth_views.parse(["a.obj", "-o", "out", *wrong.split()])
