@@ -94,7 +94,7 @@ class Suite:
     threads: int = 1
     """Threads of every run. The figures do not depend on it."""
     farm: Annotated[str, arg(metavar="local[:CORES]|ray[://HOST:PORT]")] = "local"
-    """Where the runs go; one after the other on this machine when not given."""
+    """Machine of the runs; this one, one run after the other, when not given."""
     prior: Annotated[str, arg(metavar="PRIOR")] = ""
     """Guides the guided arms, as `gsopt train --prior`; gsopt's own choice when not given."""
     llm: Annotated[str, arg(metavar="URL")] = ""

@@ -25,9 +25,9 @@ class Job:
     command: tuple[str, ...]
     """Starts a worker: a program that calls `gsopt.farm.serve.serve`."""
     request: Mapping[str, Any]
-    """JSON-ready. Where the driver's disk is not seen, its paths at and below `inputs` and `folder` are replaced."""
+    """JSON-ready. Paths at and below `inputs` and `folder` are replaced on a machine without the driver's disk."""
     folder: Path | None = None
-    """New folder that the worker makes; it appears whole or not at all. None for a job whose answer is its result."""
+    """New folder that the worker makes; it appears whole or not at all. A job without is done by its answer."""
     inputs: tuple[Path, ...] = ()
     """Files and folders that the job reads."""
     cpus: int = 1

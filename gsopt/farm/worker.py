@@ -44,7 +44,7 @@ class Worker:
         return self._alive() and self._kind == _kind(job)
 
     def do(self, job: Job, request: Any, canceled: Callable[[], bool] = lambda: False) -> Outcome:
-        """Has `request`, that of the job as this machine sees its paths, done. What goes wrong is an outcome of it."""
+        """Has `request` done, the job's with the paths of this machine. A failure is an outcome of this job only."""
         began, since = time.monotonic(), os.fstat(self._output.fileno()).st_size
         try:
             self._start(job)

@@ -35,7 +35,7 @@ def render_job(item: Item, settings: Settings, seed: int, out: Path, time_limit:
 
 
 def reason(outcome: Outcome) -> str | None:
-    """Reason why there is no object, with advice; None where there is one."""
+    """Reason for a missing object, with advice, or None."""
     return None if outcome.ending == "done" else outcome.error + ADVICE.get(outcome.ending, "")
 
 
