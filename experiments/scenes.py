@@ -40,7 +40,7 @@ def run_case(name: str, root: Path, runs: Path) -> dict[str, Any]:
     """Train one case into `runs`/name and return its record."""
     folder, flags = CASES[name]
     data = Path(folder) if folder == DEMO else root / folder
-    command = ["train", str(data), "-m", str(runs / name), *flags]
+    command = ["train", str(data), "-m", str(runs / name), "--vgg", *flags]
     subprocess.run([sys.executable, "-m", "gsopt", *command], check=True)
     metrics = json.loads((runs / name / "metrics.json").read_text())
     record = {key: metrics.get(key) for key in KEPT}

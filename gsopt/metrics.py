@@ -32,7 +32,7 @@ LPIPS_EPS = 1e-10
 VGG_VARIABLE = "GSOPT_LPIPS_VGG"
 VGG_FILE = "lpips_vgg16.npz"
 VGG_NOTE = (
-    f"LPIPS (VGG) is left out: its weights, {VGG_FILE}, were not found. Set {VGG_VARIABLE} to that file; "
+    f"LPIPS (VGG) needs its weights, {VGG_FILE}, which were not found. Set {VGG_VARIABLE} to that file; "
     "gsopt/weights/LICENSES.md says how to make it from the packages torchvision and lpips."
 )
 MAX_WEIGHT_BYTES = 200 * 2**20

@@ -56,6 +56,8 @@ class RunConsole:
                 self.say(f"{kind}: {event['message']}")
             case "progress":
                 self._progress(event)
+            case "evaluation":
+                self._evaluation(event)
             case "stopped":
                 self.close()
                 self.say(f"stopped after step {event['step']}; continue with: gsopt train --resume -m {self._run}")
@@ -92,6 +94,13 @@ class RunConsole:
         if self._live is None:
             self._console.print(line, markup=False)
         self._write_log(line)
+
+    def _evaluation(self, event: Mapping[str, Any]) -> None:
+        """The live line counts evaluated views."""
+        if self._live is not None:
+            views, total = event["views"], event["total"]
+            numbers = f"view {views}/{total}"
+            self._live.update(self._task, description="evaluating", completed=views, total=total, numbers=numbers)
 
     def _write_log(self, line: str) -> None:
         """Append to log.txt, unless that is where stdout goes anyway. A log that cannot be written stops nothing."""

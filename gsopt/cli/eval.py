@@ -17,8 +17,8 @@ class Flags:
 
     run: tyro.conf.Positional[Path]
     """The run directory that `gsopt train` wrote."""
-    vgg: bool = True
-    """Also compute LPIPS (VGG), which takes most of the time; needs its weights."""
+    vgg: bool = False
+    """Also compute LPIPS (VGG), at many times the cost of the rest; needs its weights."""
     report: bool = True
     """Write report.html anew with these figures."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
@@ -50,8 +50,8 @@ def main(argv: Sequence[str]) -> int:
 
 
 def summary(metrics: dict[str, Any]) -> str:
-    """The means as one line, the reason when there are none, and the notes."""
-    lines = list(metrics["notes"])
+    """The means as one line, or the reason when there are none."""
+    lines: list[str] = []
     if metrics["mean"] is not None:
         lines.append(f"Held-out views ({len(metrics['per_view'])}): {_figures(metrics['mean'])}")
     else:
@@ -67,8 +67,9 @@ def _figures(mean: dict[str, float | None]) -> str:
         columns["psnr_object"] = ("PSNR inside the masks", ".2f", " dB")
     parts = []
     for key, (title, digits, unit) in columns.items():
-        value = mean[key]
-        parts.append(f"{title} {'not computed' if value is None else format(value, digits) + unit}")
+        if key in mean:
+            value = mean[key]
+            parts.append(f"{title} {'not computed' if value is None else format(value, digits) + unit}")
     return ", ".join(parts)
 
 

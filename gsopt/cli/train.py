@@ -16,7 +16,7 @@ from gsopt.errors import UsageError
 RUNS = Path("runs")
 
 # Flags that may stand beside --resume when DATA does not: they choose where and how fast, not what.
-WITH_RESUME = ("run", "resume", "threads", "checkpoint_every", "preview_every")
+WITH_RESUME = ("run", "resume", "vgg", "threads", "checkpoint_every", "preview_every")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -30,7 +30,9 @@ def main(argv: Sequence[str]) -> int:
 
         console = RunConsole(run)
         try:
-            result = reconstruct(None, run, config=config, resume=flags.resume, on_progress=console, log=console.say)
+            result = reconstruct(
+                None, run, config=config, resume=flags.resume, vgg=flags.vgg, on_progress=console, log=console.say
+            )
             console.close()
             if result.metrics is None:
                 console.say(f"splats so far: {run / 'splat.ply'}")
@@ -46,7 +48,7 @@ def summary(metrics: Mapping[str, Any]) -> str:
     """One line of figures, and whose they are."""
     held_out = metrics["mean"] is not None
     judged = metrics if held_out else metrics["train"]
-    names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips_alex": "LPIPS {:.4f}"}
+    names = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.4f}", "lpips_alex": "LPIPS {:.4f}", "lpips_vgg": "(VGG {:.4f})"}
     names["psnr_object"] = "{:.2f} dB inside the masks"
     mean = judged["mean"]
     figures = [text.format(mean[name]) for name, text in names.items() if mean.get(name) is not None]

@@ -68,6 +68,8 @@ class Flags:
     """Folder to write to; by default the first free runs/<dataset>-<n>."""
     resume: bool = False
     """Continue the run in that folder from its newest checkpoint, with the same result as if it had never stopped."""
+    vgg: bool = False
+    """Also compute LPIPS (VGG) on the held-out views, at many times the cost of the rest; needs its weights."""
     white_background: Annotated[bool, arg(aliases=["-w"])] = False
     """The same as --background white, which is the default."""
     settings: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)

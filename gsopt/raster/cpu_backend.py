@@ -17,6 +17,7 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame, enough_memory
 from gsopt.raster.tensors import as_float32, contiguous, overwritable
+from gsopt.raster.threads import available_cores
 
 ISA_VARIABLE = "GSOPT_ISA"
 GRADIENTS = tuple(field.name for field in fields(Gradients))
@@ -26,7 +27,7 @@ def workspace(threads: int = 0) -> Any:
     """Makes a pool of `threads` (0: one per core) and picks an instruction set, the best one or that which the
     environment variable GSOPT_ISA (avx512, avx2, avx2x2, portable) names; UsageError if this processor lacks it."""
     try:
-        return _cpu.Workspace(threads or _available_cores(), os.environ.get(ISA_VARIABLE, ""))
+        return _cpu.Workspace(threads or available_cores(), os.environ.get(ISA_VARIABLE, ""))
     except ValueError as error:
         raise UsageError(f"{ISA_VARIABLE}: {error}.") from error
 
@@ -200,7 +201,3 @@ class _Views(dict[tuple[Any, ...], Any]):
                 self.clear()
             self[key] = _cpu.Camera(viewmat.flatten().tolist(), K.flatten().tolist(), *size, *drawn_by)
         return self[key]
-
-
-def _available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

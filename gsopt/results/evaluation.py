@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,9 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
 from gsopt.events import LARGEST_METRICS, refuse_links, to_json, write_atomic
 from gsopt.gaussians import Gaussians
-from gsopt.metrics import PSNR_CAP, VGG_NOTE, Lpips, capped_psnr, find_vgg_weights, object_psnr, ssim
+from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, object_psnr
 from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.raster.threads import available_cores, one_torch_thread
 from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
 from gsopt.results.video import safe_name, save_stills
 
@@ -27,7 +30,9 @@ MAX_TRAIN_VIEWS = 16
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "psnr_object")
 """Metrics of a view; the last only where it has alpha."""
 METRIC_DIGITS = 6
-"""Decimals of a metric; further ones depend on the number of torch's threads."""
+"""Decimals of a metric; further ones depend on the version of torch."""
+MAX_WORKERS = 8
+"""Views that are compared at a time: each takes some 100 MB at 800 x 800 px, three times that with VGG."""
 
 NO_TEST_VIEWS = (
     "This run held out no views, so its quality on new views is unknown: metrics of training views stand under `train` "
@@ -35,6 +40,12 @@ NO_TEST_VIEWS = (
 )
 
 OnView = Callable[[int, int], None]
+
+
+def networks(vgg: bool = False) -> dict[str, Lpips]:
+    """The networks of LPIPS by metric. Raises InputError where weights are missing or broken; call it before the work
+    that is to be evaluated."""
+    return {"lpips_alex": Lpips("alex")} | ({"lpips_vgg": Lpips("vgg")} if vgg else {})
 
 
 def evaluate_views(
@@ -45,43 +56,71 @@ def evaluate_views(
     background: Float[Tensor, "3"],
     save_dir: Path | None,
     *,
-    vgg: bool = True,
+    vgg: bool = False,
+    threads: int = 0,
     on_view: OnView | None = None,
 ) -> dict[str, Any]:
-    """Returns `{"mean": {psnr, ssim, lpips_alex, lpips_vgg}, "per_view": [{name, ..., render}]}`.
+    """Returns `{"mean": {psnr, ssim, lpips_alex}, "per_view": [{name, ..., render}]}`, with `vgg` lpips_vgg too.
 
-    Renders and truths are rounded to 8 bit first. A value that cannot be computed (no VGG weights, image too small for
-    the network) is None, and so is its mean. `render` is the PNG's name in `save_dir`; `on_view(done, total)` reports.
+    Renders and truths are rounded to 8 bit first. A value that cannot be computed (an image too small for the network)
+    is None, and so is its mean. `render` is the PNG's name in `save_dir`; `on_view(done, total)` reports. While one
+    view is drawn, `threads` others (0: one per core) are compared, with the same figures for any number of them.
     """
-    networks = _networks(vgg)
-    per_view: list[dict[str, Any]] = []
-    for index, view in enumerate(views):
-        render = draw(gaussians, view.camera, backend, settings, background)
-        seen = truth(view, background)
-        row: dict[str, Any] = {"name": view.name, **_image_metrics(render, seen, networks)}
-        row |= _object_metrics(render, seen, view)
-        if save_dir is not None:
-            (path,) = save_stills(save_dir, [(safe_name(index, view.name), render)], overwrite=True)
-            row["render"] = path.name
-        per_view.append(row)
+    nets, per_view = networks(vgg), list[dict[str, Any]]()
+    running: deque[Future[dict[str, Any]]] = deque()
+    workers = min(threads or available_cores(), MAX_WORKERS)
+
+    def collect() -> None:
+        per_view.append(running.popleft().result())
         if on_view is not None:
             on_view(len(per_view), len(views))
+
+    with one_torch_thread(), ThreadPoolExecutor(workers) as pool:
+        try:
+            for index, view in enumerate(views):
+                render, seen = draw(gaussians, view.camera, backend, settings, background), truth(view, background)
+                similarity = _ssim(render, seen, backend)
+                path = None if save_dir is None else save_dir / safe_name(index, view.name)
+                running.append(pool.submit(_compared, render, seen, view, similarity, nets, path))
+                if len(running) > workers:
+                    collect()
+            while running:
+                collect()
+        finally:
+            pool.shutdown(cancel_futures=True)
     return {"mean": _mean(per_view), "per_view": per_view}
 
 
-def _networks(vgg: bool) -> dict[str, Lpips | None]:
-    has_vgg = vgg and find_vgg_weights() is not None
-    return {"lpips_alex": Lpips("alex"), "lpips_vgg": Lpips("vgg") if has_vgg else None}
+def _ssim(render: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], backend: Backend) -> float:
+    """The SSIM of gsopt/raster/ssim.py by the backend's kernel: a hundredth of the time on a CPU."""
+    a, b = (image.to(backend.device).float() / 255 for image in (render, target))
+    return backend.photometric(a, b, 0.0).ssim
+
+
+def _compared(
+    render: UInt8[Tensor, "H W 3"],
+    seen: UInt8[Tensor, "H W 3"],
+    view: View,
+    similarity: float,
+    nets: dict[str, Lpips],
+    path: Path | None,
+) -> dict[str, Any]:
+    """The row of one view, whose render is saved as `path` with the suffix .png."""
+    row: dict[str, Any] = {"name": view.name, **_image_metrics(render, seen, similarity, nets)}
+    row |= _object_metrics(render, seen, view)
+    if path is not None:
+        (saved,) = save_stills(path.parent, [(path.name, render)], overwrite=True)
+        row["render"] = saved.name
+    return row
 
 
 def _image_metrics(
-    render: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], networks: dict[str, Lpips | None]
+    render: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], similarity: float, nets: dict[str, Lpips]
 ) -> dict[str, float | None]:
     a, b = (image[None].float() / 255 for image in (render, target))
-    values: dict[str, float | None] = {"psnr": capped_psnr(a, b).item(), "ssim": ssim(a, b).item()}
-    for name, network in networks.items():
-        usable = network is not None and network.fits(*render.shape[:2])
-        values[name] = network(a, b).item() if network is not None and usable else None
+    values: dict[str, float | None] = {"psnr": capped_psnr(a, b).item(), "ssim": similarity}
+    for name, network in nets.items():
+        values[name] = network(a, b).item() if network.fits(*render.shape[:2]) else None
     return {name: None if value is None else round(value, METRIC_DIGITS) for name, value in values.items()}
 
 
@@ -115,11 +154,12 @@ def evaluate(
     *,
     backend: str | None = None,
     threads: int | None = None,
-    vgg: bool = True,
+    vgg: bool = False,
     scene: Scene | None = None,
     on_view: OnView | None = None,
 ) -> dict[str, Any]:
-    """Evaluates a finished run on its held-out views and writes metrics.json, whose other fields are kept.
+    """Evaluates a finished run on its held-out views and writes metrics.json, whose other fields are kept. `vgg`: LPIPS
+    by VGG too, at many times the cost of the rest.
 
     `scene` saves loading it again. With nothing held out `mean` is null, `reason` explains it, and some input views are
     evaluated under `train`, at their refined poses if the run has any. Renders go to RUN/renders/{test,train}. Raises
@@ -129,7 +169,7 @@ def evaluate(
     finished = open_run(Path(run), backend, threads)
     kept = _kept(finished)  # before the work, so that a broken file is not replaced
     scene = with_refined_poses(scene or load_scene(finished.config.data), finished.path)
-    results = _results(finished, scene, vgg, on_view)
+    results = _results(finished, scene, vgg, finished.config.threads if threads is None else threads, on_view)
     document = {**kept, **results, "protocol": _protocol(finished, scene, results)}
     write_atomic(finished.path / "metrics.json", to_json(document))
     return document
@@ -162,16 +202,15 @@ def read_metrics(run: Path) -> dict[str, Any]:
     return document
 
 
-def _results(finished: FinishedRun, scene: Scene, vgg: bool, on_view: OnView | None) -> dict[str, Any]:
+def _results(finished: FinishedRun, scene: Scene, vgg: bool, threads: int, on_view: OnView | None) -> dict[str, Any]:
     split, views = ("test", scene.test) if scene.test else ("train", evenly_spread(scene.train, MAX_TRAIN_VIEWS))
     drawing = finished.backend, finished.settings, finished.background, finished.path / "renders" / split
-    evaluated = evaluate_views(finished.gaussians, views, *drawing, vgg=vgg, on_view=on_view)
+    evaluated = evaluate_views(finished.gaussians, views, *drawing, vgg=vgg, threads=threads, on_view=on_view)
     for row in evaluated["per_view"]:
         row["render"] = f"renders/{split}/{row['render']}"
-    notes = [VGG_NOTE] if vgg and find_vgg_weights() is None else []
     if split == "test":
-        return {**evaluated, "reason": None, "train": None, "notes": notes}
-    return {"mean": None, "per_view": [], "reason": NO_TEST_VIEWS, "train": evaluated, "notes": notes}
+        return {**evaluated, "reason": None, "train": None, "notes": []}
+    return {"mean": None, "per_view": [], "reason": NO_TEST_VIEWS, "train": evaluated, "notes": []}
 
 
 def evenly_spread(views: Sequence[View], count: int) -> list[View]:
@@ -194,11 +233,14 @@ def _about(finished: FinishedRun) -> dict[str, Any]:
 def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> str:
     """The evaluation protocol, as a note below a table."""
     evaluated = len(results["per_view"]) or len(results["train"]["per_view"])
+    asked = (results["per_view"] or results["train"]["per_view"] or [{}])[0]
+    lpips = "LPIPS v0.1 Alex" + (
+        " and VGG (the Inria code feeds VGG [0,1] unscaled, which gives other values)" if "lpips_vgg" in asked else ""
+    )
     background = {"random": "white (trained on random)"}.get(finished.config.data.background)
     return (
         "PSNR per image then mean; psnr_object inside the truth's alpha; SSIM 11x11 sigma 1.5 zero padding; "
-        "LPIPS v0.1 Alex and VGG, inputs mapped to [-1,1] "
-        "(the Inria code feeds VGG [0,1] unscaled, which gives other values); renders and truths rounded to 8 bit as "
+        f"{lpips}, inputs mapped to [-1,1]; renders and truths rounded to 8 bit as "
         f"the field does; equal images count as {PSNR_CAP:g} dB; background "
         f"{background or finished.config.data.background}; split: trained on {len(scene.train)} views, held out "
         f"{len(scene.test)}, evaluated on {evaluated} {'held-out' if scene.test else 'training'} views; images "

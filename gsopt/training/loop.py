@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from gsopt.config.train import TrainConfig
-from gsopt.data.scene import Scene
+from gsopt.data.scene import Scene, View
 from gsopt.errors import InputError, NumericalError
 from gsopt.events import to_json, write_atomic
 from gsopt.formats.ply import save_ply
@@ -24,6 +24,7 @@ from gsopt.init.mask_repair import RepairedMask, load_with_agreeing_masks
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.raster.device.memory import PRIOR_BYTES, Memory
+from gsopt.raster.threads import one_torch_thread
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.finite import require_finite, require_finite_loss
@@ -81,6 +82,7 @@ def train(
         backend = make_backend(config.backend, config.threads, config.device)
         with one_torch_thread(), on_its_gpu(backend):
             scene, repaired = load_with_agreeing_masks(config.data)
+            require_readable(scene.test)
             scene = with_recorded_mirrors(config, scene, directory)
             scene = with_library_body(config, scene, backend, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
@@ -112,21 +114,6 @@ def train(
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Torch's own threads off: its reductions add up in another order for every number of threads.
-
-    The backend has its own threads and the same bits for any number of them; what is left to torch is a small part
-    of a step.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextmanager
 def on_its_gpu(backend: Backend) -> Iterator[None]:
     """The backend's GPU is torch's current one: a prior that asks for "cuda" goes beside it."""
     if backend.device.type != "cuda":
@@ -134,6 +121,12 @@ def on_its_gpu(backend: Backend) -> Iterator[None]:
         return
     with torch.cuda.device(backend.device):
         yield
+
+
+def require_readable(views: Sequence[View]) -> None:
+    """Raise InputError for a held-out image that cannot be decoded, before the work that it is to evaluate."""
+    for view in views:
+        view.pixels()
 
 
 def require_memory(plan: RunPlan, scene: Scene, backend: Backend, guidance: RunGuidance | None) -> None:

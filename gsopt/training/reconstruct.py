@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import timedelta
@@ -16,14 +17,13 @@ from gsopt.errors import UsageError
 from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import Gaussians
 from gsopt.init.cut_out import with_made_masks
-from gsopt.metrics import find_vgg_weights
-from gsopt.results.evaluation import evaluate, read_metrics
+from gsopt.results.evaluation import OnView, evaluate, networks, read_metrics
 from gsopt.results.report import write_report
 from gsopt.training.guided.start import require_guidance
 from gsopt.training.interrupt import Stopped, StopRequest
 from gsopt.training.library_body import require_library
-from gsopt.training.loop import TrainResult, train
-from gsopt.training.run_directory import Listener, opened, refuse_another_run
+from gsopt.training.loop import PROGRESS_SECONDS, TrainResult, train
+from gsopt.training.run_directory import Listener, RunDirectory, opened, refuse_another_run
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ def reconstruct(
     *,
     config: TrainConfig | None = None,
     resume: bool = False,
+    vgg: bool = False,
     on_progress: Listener | None = None,
     log: Report = lambda line: None,
     **settings: Any,
@@ -53,8 +54,9 @@ def reconstruct(
 
     `data`: a dataset, a folder of photos, a video, a DataConfig, or None for that of `config` or, with `resume`, the
     settings in `run`. `settings`: fields of TrainConfig, a section as a dict: `preset="draft"`,
-    `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `on_progress` is called with every event, `log`
-    with lines for people. Raises a GsoptError; a wrong setting, prompt or prior raises it before any work.
+    `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `vgg`: LPIPS by VGG too. `on_progress` is called
+    with every event, `log` with lines for people. Raises a GsoptError; a wrong setting, prompt or prior, an unreadable
+    held-out image or missing weights raise it before any work.
     """
     run = Path(run)
     config = _with_absolute_paths(_configured(data, run, config, resume, settings))
@@ -62,14 +64,15 @@ def reconstruct(
         refuse_another_run(run)
         require_guidance(config.guidance)
         require_library(config.guidance)
-    find_vgg_weights()  # a variable that names no file is noticed now, not after the training
+    networks(vgg)
+    read_metrics(run)
     config = _with_masks(_with_poses(config, run, log), run, log)
     with StopRequest(run / "stop") as stop:
         result = train(config, run, resume=resume, on_progress=on_progress, done=False)
         if result.stopped:
             return Reconstruction(result.run, result.gaussians, None, None)
         log(f"trained in {timedelta(seconds=round(result.train_seconds))}; evaluating {result.run / 'splat.ply'}")
-        metrics, report = _evaluated(config, result, on_progress, stop)
+        metrics, report = _evaluated(config, result, vgg, on_progress, stop)
     return Reconstruction(result.run, result.gaussians, metrics, report)
 
 
@@ -138,7 +141,7 @@ def _with_masks(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
 
 
 def _evaluated(
-    config: TrainConfig, result: TrainResult, listener: Listener | None, stop: StopRequest
+    config: TrainConfig, result: TrainResult, vgg: bool, listener: Listener | None, stop: StopRequest
 ) -> tuple[dict[str, Any] | None, Path | None]:
     """Evaluate, write the report, and end the run with the event `done`.
 
@@ -155,11 +158,26 @@ def _evaluated(
     with opened(result.run, config, resume=True, listener=listener) as directory:
         write_atomic(result.run / "metrics.json", to_json({**read_metrics(result.run), **facts}))
         ended = {"step": result.steps, "n": len(result.gaussians), "seconds": facts["train_seconds"]}
+        follow = _follower(directory, stop)
         try:
-            metrics = evaluate(result.run, threads=config.threads, scene=result.scene, on_view=stop.check)
+            metrics = evaluate(result.run, threads=config.threads, vgg=vgg, scene=result.scene, on_view=follow)
         except Stopped:
             directory.emit("stopped", **ended)
             return None, None
         report = write_report(result.run)
         directory.emit("done", **ended)
     return metrics, report
+
+
+def _follower(directory: RunDirectory, stop: StopRequest) -> OnView:
+    """Reports evaluated views about twice per second and at the end; raises Stopped when someone asked to stop."""
+    reported = time.perf_counter()
+
+    def follow(views: int, total: int) -> None:
+        nonlocal reported
+        stop.check()
+        if views == total or time.perf_counter() - reported >= PROGRESS_SECONDS:
+            reported = time.perf_counter()
+            directory.emit("evaluation", views=views, total=total)
+
+    return follow

@@ -12,9 +12,10 @@ import torch
 from finished_runs import WHITE, make_run, splats
 from PIL import Image
 
+from gsopt import metrics as metrics_module
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
-from gsopt.metrics import PSNR_CAP, VGG_VARIABLE
+from gsopt.metrics import PSNR_CAP, VGG_VARIABLE, Lpips, ssim
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.results import evaluation
@@ -33,15 +34,15 @@ def imperfect(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_splats_that_made_the_truth_are_perfect(perfect: Path) -> None:
-    metrics = evaluate(perfect, vgg=False)
-    assert metrics["mean"] == {"psnr": PSNR_CAP, "ssim": 1.0, "lpips_alex": 0.0, "lpips_vgg": None}
+    metrics = evaluate(perfect)
+    assert metrics["mean"] == {"psnr": PSNR_CAP, "ssim": 1.0, "lpips_alex": 0.0}
     assert [row["name"] for row in metrics["per_view"]] == ["test/r_0.png", "test/r_1.png"]
     assert metrics["reason"] is None
     assert metrics["train"] is None
 
 
 def test_the_means_are_the_means_of_the_views(imperfect: Path) -> None:
-    metrics = evaluate(imperfect, vgg=False)
+    metrics = evaluate(imperfect)
     for key in ("psnr", "ssim", "lpips_alex"):
         values = [row[key] for row in metrics["per_view"]]
         assert metrics["mean"][key] == pytest.approx(np.mean(values), abs=1e-6)
@@ -51,7 +52,7 @@ def test_the_means_are_the_means_of_the_views(imperfect: Path) -> None:
 
 def test_figures_belong_to_the_pictures_that_were_saved(imperfect: Path) -> None:
     """PSNR of the PNG files equals the reported value."""
-    metrics = evaluate(imperfect, vgg=False)
+    metrics = evaluate(imperfect)
     row = metrics["per_view"][0]
     picture, target = (
         np.asarray(Image.open(path).convert("RGB"), dtype=np.float64) / 255
@@ -62,7 +63,7 @@ def test_figures_belong_to_the_pictures_that_were_saved(imperfect: Path) -> None
 
 def test_metrics_json_keeps_what_others_wrote_and_is_strict_json(perfect: Path) -> None:
     (perfect / "metrics.json").write_text(json.dumps({"train_seconds": 12.5, "peak_memory_mb": 99, "mean": "old"}))
-    evaluate(perfect, vgg=False)
+    evaluate(perfect)
     document = json.loads((perfect / "metrics.json").read_text(), parse_constant=pytest.fail)
     assert (document["train_seconds"], document["peak_memory_mb"]) == (12.5, 99)
     assert document["mean"]["ssim"] == 1.0
@@ -76,14 +77,14 @@ def test_a_broken_metrics_file_is_not_replaced(tmp_path: Path) -> None:
     run = make_run(tmp_path, train=1, test=1)
     (run / "metrics.json").write_text("{")
     with pytest.raises(InputError, match="Move it away"):
-        evaluate(run, vgg=False)
+        evaluate(run)
     assert (run / "metrics.json").read_text() == "{"
     assert not (run / "renders").exists()
 
 
 def test_without_held_out_views_nothing_is_called_held_out(tmp_path: Path) -> None:
     run = make_run(tmp_path, train=3, test=0)
-    metrics = evaluate(run, vgg=False)
+    metrics = evaluate(run)
     assert metrics["mean"] is None
     assert metrics["per_view"] == []
     assert "not reported as held-out" in metrics["reason"]
@@ -100,18 +101,34 @@ def test_a_run_that_has_not_finished_or_is_none_is_an_input_error(tmp_path: Path
         evaluate(run)
 
 
-def test_vgg_without_weights_is_null_and_says_how_to_get_them(perfect: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(VGG_VARIABLE, raising=False)
-    monkeypatch.setattr(evaluation, "find_vgg_weights", lambda: None)
-    metrics = evaluate(perfect)
-    assert metrics["mean"]["lpips_vgg"] is None
-    assert VGG_VARIABLE in metrics["notes"][0]
+def test_vgg_without_weights_says_how_to_get_them_and_nobody_asks_for_it_unasked(
+    perfect: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metrics_module, "find_vgg_weights", lambda: None)
+    with pytest.raises(InputError, match=VGG_VARIABLE):
+        evaluate(perfect, vgg=True)
+    assert "lpips_vgg" not in evaluate(perfect)["mean"]
+
+
+def test_figures_do_not_depend_on_threads_and_are_those_of_the_metrics(imperfect: Path) -> None:
+    """Views are compared side by side, each by one thread; SSIM comes from the backend's kernel."""
+    run = open_run(imperfect)
+    views = load_scene(run.config.data).test * 3
+    drawing = run.gaussians, views, run.backend, run.settings, run.background, None
+    seen: list[tuple[int, int]] = []
+    rows = evaluate_views(*drawing, threads=3, on_view=lambda done, total: seen.append((done, total)))["per_view"]
+    assert rows == evaluate_views(*drawing, threads=1)["per_view"]
+    assert seen == [(done, 6) for done in range(1, 7)]
+    for row, view in zip(rows, views, strict=True):
+        render, target = (image[None] / 255 for image in (run.draw(view.camera), truth(view, run.background)))
+        assert row["ssim"] == pytest.approx(ssim(render, target).item(), abs=2e-6)
+        assert row["lpips_alex"] == pytest.approx(Lpips("alex")(render, target).item(), abs=2e-6)
 
 
 def test_images_too_small_for_a_network_have_no_such_figure(perfect: Path) -> None:
     scene = load_scene(str(perfect.parent / "data"))
     small = [type(view)(view.name, view.camera.resized(20, 16), _Halved(view.store), view.index) for view in scene.test]
-    result = evaluate_views(splats(), small, ReferenceBackend(), RasterSettings(sh_degree=0), WHITE, None, vgg=False)
+    result = evaluate_views(splats(), small, ReferenceBackend(), RasterSettings(sh_degree=0), WHITE, None)
     assert result["mean"]["lpips_alex"] is None
     assert 0 < result["mean"]["psnr"] < PSNR_CAP
     assert "render" not in result["per_view"][0]
@@ -141,7 +158,7 @@ def test_transparent_truth_is_put_on_the_background() -> None:
 
 
 def test_no_views_have_no_mean() -> None:
-    result = evaluate_views(splats(), [], ReferenceBackend(), RasterSettings(sh_degree=0), WHITE, None, vgg=False)
+    result = evaluate_views(splats(), [], ReferenceBackend(), RasterSettings(sh_degree=0), WHITE, None)
     assert result == {"mean": None, "per_view": []}
 
 
@@ -155,10 +172,10 @@ def test_input_views_are_evaluated_at_their_refined_poses(tmp_path: Path) -> Non
         pose[:3, 3] -= pose[:3, :3] @ torch.tensor(scene.origin, dtype=torch.float64)
         poses.append({"name": view.name, "cam_from_world": pose.tolist()})
     (run / "poses.json").write_text(json.dumps({"views": poses}))
-    assert evaluate(run, vgg=False)["train"]["mean"]["psnr"] == PSNR_CAP
+    assert evaluate(run)["train"]["mean"]["psnr"] == PSNR_CAP
     poses[1]["cam_from_world"][0][3] += 0.2
     (run / "poses.json").write_text(json.dumps({"views": poses}))
-    first, second = evaluate(run, vgg=False)["train"]["per_view"]
+    first, second = evaluate(run)["train"]["per_view"]
     assert first["psnr"] == PSNR_CAP
     assert second["psnr"] < 40
 
@@ -167,7 +184,7 @@ def test_some_of_many_input_views_are_evaluated_evenly_spread(tmp_path: Path, mo
     monkeypatch.setattr(evaluation, "MAX_TRAIN_VIEWS", 3)
     run = make_run(tmp_path, train=7, test=0)
     names = [view.name for view in load_scene(str(tmp_path / "data")).train]
-    evaluated = [row["name"] for row in evaluate(run, vgg=False)["train"]["per_view"]]
+    evaluated = [row["name"] for row in evaluate(run)["train"]["per_view"]]
     assert evaluated == [names[0], names[2], names[4]]
 
 
@@ -175,7 +192,7 @@ def test_a_metric_that_some_views_lack_has_no_mean(perfect: Path) -> None:
     whole, other = load_scene(str(perfect.parent / "data")).test
     small = type(other)(other.name, other.camera.resized(20, 16), _Halved(other.store), other.index)
     views, backend = [whole, small], ReferenceBackend()
-    result = evaluate_views(splats(), views, backend, RasterSettings(sh_degree=0), WHITE, None, vgg=False)
+    result = evaluate_views(splats(), views, backend, RasterSettings(sh_degree=0), WHITE, None)
     assert [row["lpips_alex"] is None for row in result["per_view"]] == [False, True]
     assert result["mean"]["lpips_alex"] is None
     assert result["mean"]["psnr"] == pytest.approx(np.mean([row["psnr"] for row in result["per_view"]]), abs=1e-5)
@@ -188,7 +205,7 @@ def test_renders_do_not_leave_a_foreign_run_through_a_link(tmp_path: Path, name:
     (run / name).parent.mkdir(exist_ok=True)
     (run / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="symbolic link"):
-        evaluate(run, vgg=False)
+        evaluate(run)
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
@@ -202,7 +219,7 @@ def test_fields_that_cannot_be_kept_are_an_input_error_before_the_work(tmp_path:
     for value in ("NaN", *("[" * depth + "]" * depth for depth in range(900, 1000, 10))):
         (run / name).write_text(json.dumps({**document, key: "HERE"}).replace('"HERE"', value))
         with pytest.raises(InputError) as error:
-            evaluate(run, vgg=False)
+            evaluate(run)
         errors.append(str(error.value))
     assert "strict JSON" in errors[0]
 
@@ -228,6 +245,6 @@ def test_the_object_is_measured_where_a_view_has_alpha(
     if alpha is not None:
         pixels = torch.cat([pixels, torch.full_like(pixels[..., :1], alpha)], dim=2)
     masked = replace(view, store=OneImage(pixels), index=0)
-    drawn = evaluate_views(run.gaussians, [masked], run.backend, run.settings, run.background, None, vgg=False)
+    drawn = evaluate_views(run.gaussians, [masked], run.backend, run.settings, run.background, None)
     assert drawn["per_view"][0].get("psnr_object", "absent") == expected
     assert drawn["mean"].get("psnr_object", "absent") == expected

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from gsopt import cli
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.errors import GsoptError, InputError, SettingError, UsageError
 from gsopt.events import read_events
+from gsopt.results.evaluation import read_metrics
 
 SHORT = {"iterations": 4, "init": {"method": "random", "count": 20}, "guidance": {"lambda_sds": 0.0}}
 FLAGS = "--iterations 4 --init random --init-count 20 --lambda_sds 0 --views 2"
@@ -79,8 +81,26 @@ def test_weights_that_are_not_there_are_noticed_before_any_work(
 ) -> None:
     monkeypatch.setenv("GSOPT_LPIPS_VGG", str(tmp_path / "absent.npz"))
     with pytest.raises(InputError, match=r"absent\.npz"):
-        gsopt.reconstruct(data, tmp_path / "run", **SHORT)
+        gsopt.reconstruct(data, tmp_path / "run", vgg=True, **SHORT)
     assert not (tmp_path / "run").exists()
+    assert gsopt.reconstruct(data, tmp_path / "run", **SHORT).metrics is not None  # nobody asks for it here
+
+
+def test_a_held_out_image_that_cannot_be_read_ends_the_run_before_its_first_step(data: Path, tmp_path: Path) -> None:
+    shutil.copytree(data, tmp_path / "data")
+    image = next((tmp_path / "data" / "test").glob("*.png"))
+    image.write_bytes(image.read_bytes()[:-40])
+    with pytest.raises(InputError, match=image.name):
+        gsopt.reconstruct(tmp_path / "data", tmp_path / "run", **SHORT)
+    kinds = {event["kind"] for event in read_events(tmp_path / "run" / "events.jsonl")[0]}
+    assert "started" not in kinds
+
+
+def test_events_count_the_views_that_were_evaluated(data: Path, tmp_path: Path) -> None:
+    gsopt.reconstruct(data, tmp_path / "run", **SHORT)
+    events = read_events(tmp_path / "run" / "events.jsonl")[0]
+    last = [event for event in events if event["kind"] == "evaluation"][-1]
+    assert last["views"] == last["total"] == len(read_metrics(tmp_path / "run")["per_view"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])

@@ -145,6 +145,7 @@ def machine_flags(case: Case, context: SuiteContext) -> list[str]:
     """Flags that change the speed of a run and its previews, but no bit of its result."""
     flags = ["--threads", str(context.threads), "--checkpoint-every", "0"]
     flags += ["--preview-every", str(max(1, case.iterations // EVALUATIONS))]
+    flags += ["--vgg"] if find_vgg_weights() is not None else []
     if arm_flags.is_guided(case.arm) and context.prior:
         flags += ["--prior", context.prior]
     path = prompts(case, context)
@@ -212,7 +213,7 @@ def recorded(case: Case, run: Path, run_hash: str, threads: int) -> tuple[dict[s
     scene = load_scene(finished.config.data)
     started = next(event for event in events if event["kind"] == "started")
     setup = float(started.get("setup_cpu_seconds", 0.0))
-    per_view = {name: [row[name] for row in metrics["per_view"]] for name in METRICS[:4]}
+    per_view = {name: [row.get(name) for row in metrics["per_view"]] for name in METRICS[:4]}
     per_view |= run_figures.shape(finished, scene)
     record = {
         **case.fields,

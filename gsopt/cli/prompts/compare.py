@@ -64,10 +64,10 @@ def main(argv: Sequence[str]) -> int:
 
     from gsopt.data.scene import load_scene
     from gsopt.raster.api import make_backend
+    from gsopt.raster.threads import one_torch_thread
     from gsopt.sds.load_prior import open_prior
     from gsopt.sds.select_prior import select_prior
     from gsopt.training.guided.compare_prompts import compare_prompts
-    from gsopt.training.loop import one_torch_thread
 
     choice = select_prior(config.guidance)
     if choice.name is None:  # a weight was given: a prior that is not there is an error

@@ -19,9 +19,9 @@ VIEW_SIDE = 400
 NO_VALUE = "\N{EN DASH}"
 """Replaces a missing value."""
 TURNTABLE_FPS = 12.0
-TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (Alex)", "lpips_vgg": "LPIPS (VGG)"}
-OBJECT_TITLES = {"psnr_object": "PSNR of the object"}
-"""Metrics inside masks, shown where the views have some."""
+TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (Alex)"}
+OPTIONAL_TITLES = {"lpips_vgg": "LPIPS (VGG)", "psnr_object": "PSNR of the object"}
+"""Metrics that somebody asked for, and inside masks where the views have some."""
 HINTS = {"psnr": "dB, higher is better", "ssim": "higher is better", "psnr_object": "dB inside the masks"}
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4, "psnr_object": 2}
 # A page loads nothing: images are data URIs, styles are inline, and there are no scripts but the viewer's.
@@ -101,9 +101,9 @@ def _tiles(report: Report) -> Iterable[str]:
 
 
 def titles(report: Report) -> dict[str, str]:
-    """Titles of the metrics that this run has."""
-    inside = {key: title for key, title in OBJECT_TITLES.items() if report.mean.get(key) is not None}
-    return TITLES | inside
+    """Titles of the metrics that this run has: the usual ones, and others where they were computed."""
+    computed = {key: title for key, title in OPTIONAL_TITLES.items() if report.mean.get(key) is not None}
+    return TITLES | computed
 
 
 def _tile(title: str, value: str, hint: str | None) -> str:
@@ -148,7 +148,7 @@ def _card(view: EvaluatedView) -> str:
     )
     badge = f'<span class="badge {view.badge}">{view.badge}</span>' if view.badge else ""
     figures = " · ".join(
-        f"{(TITLES | OBJECT_TITLES)[key]} {figure(key, value)}"
+        f"{(TITLES | OPTIONAL_TITLES)[key]} {figure(key, value)}"
         for key, value in view.figures.items()
         if value is not None
     )

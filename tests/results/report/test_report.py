@@ -74,7 +74,7 @@ def tell(run: Path, *, warning: str | None = None) -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(tmp_path_factory.mktemp("report"), test=3, learned=splats(seed=1))
     tell(run, warning=f"two images are absent {EVIL}")
-    evaluate(run, vgg=False)
+    evaluate(run)
     return run
 
 
@@ -103,6 +103,16 @@ def test_the_page_says_what_the_figures_say(run: Path, page: Page) -> None:
     assert "two images are absent" in page.text
 
 
+def test_nobody_who_did_not_ask_for_vgg_reads_of_it(run: Path, page: Page) -> None:
+    assert "VGG" not in page.text
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps({**metrics, "mean": {**metrics["mean"], "lpips_vgg": 0.1234}}))
+    asked = Page(write_report(run).read_text(encoding="utf-8"))
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert "LPIPS (VGG)" in asked.text
+    assert "0.1234" in asked.text
+
+
 def test_strings_from_files_stay_text(run: Path, page: Page) -> None:
     assert EVIL in page.text
     assert EVIL not in (run / "report.html").read_text(encoding="utf-8")
@@ -122,7 +132,7 @@ def test_hostile_names_and_values_in_metrics_stay_text_or_vanish(tmp_path: Path)
 
 def test_training_views_are_never_called_held_out(tmp_path: Path) -> None:
     run = make_run(tmp_path, train=2, test=0)
-    evaluate(run, vgg=False)
+    evaluate(run)
     text = Page(write_report(run).read_text(encoding="utf-8")).text
     assert "Training views (not held out)" in text
     assert "No view was held out" in text

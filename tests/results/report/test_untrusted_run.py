@@ -59,7 +59,7 @@ def test_a_dataset_whose_name_is_no_text_has_a_report(tmp_path: Path) -> None:
     document = json.loads((run / "config.json").read_text())
     document["config"]["data"]["path"] = os.fsdecode(folder)
     (run / "config.json").write_bytes(to_json(document))
-    evaluate(run, vgg=False)
+    evaluate(run)
     text = write_report(run).read_text(encoding="utf-8")
     assert "caf\\udce9" in text
     assert "Means over held-out views" in text
