@@ -18,6 +18,7 @@ VERBS = {
     "prompts": "turn an expert's words into the prompts that guide a reconstruction",
     "reconstruct": "go from photos or a video to a report: poses, masks, training",
     "train": "learn Gaussians from posed images",
+    "train-many": "learn Gaussians of many scenes, on one machine or many",
     "render": "draw a finished run as images or a video",
     "eval": "judge a finished run by its held-out views",
     "export": "write splats in another format",
@@ -98,7 +99,7 @@ def run_verb(verb: str, arguments: Sequence[str]) -> int:
     """Load the verb's module and run its `main`; UsageError for a verb that does not exist."""
     if verb not in VERBS:
         raise UsageError(unknown_verb(verb))
-    module = importlib.import_module(f"gsopt.cli.{verb}")
+    module = importlib.import_module(f"gsopt.cli.{verb.replace('-', '_')}")
     try:
         code: int = module.main(arguments)
     except SystemExit as stop:  # how argument parsers leave after --help or a wrong flag
