@@ -61,9 +61,8 @@ def write_page(records: Sequence[dict[str, Any]], count: int, path: Path, pictur
 
 
 def _mean(done: Sequence[dict[str, Any]]) -> str:
-    held_out = [
-        value for record in done if record.get("held_out") and (value := number(record.get("psnr"))) is not None
-    ]
+    judged = (number(record.get("psnr")) for record in done if record.get("held_out"))
+    held_out = [value for value in judged if value is not None]
     if not held_out:
         return "No scene has held-out views: figures are of the input views. Train with --eval."
     return f"Mean PSNR of held-out views {sum(held_out) / len(held_out):.2f} dB over {len(held_out)} scenes."

@@ -72,9 +72,7 @@ def _of_manifest(path: Path, flags: tuple[str, ...]) -> Iterator[SceneRun]:
 def _name(name: Any, where: object) -> str:
     """A name that can be a folder below RUNS."""
     if not isinstance(name, str) or not re.fullmatch(r"[^/\\\0.][^/\\\0]*", name) or len(name) > MAX_NAME:
-        raise InputError(
-            f"{where}: `name` must be the name of a folder, got {shortened(name)}. Use letters and digits."
-        )
+        raise InputError(f"{where}: `name` must name a new folder, got {shortened(name)}. Use letters and digits.")
     return name
 
 

@@ -62,14 +62,15 @@ def _opened(out: Path) -> dict[str, dict[str, Any]]:
                 raise InputError(f"{out} is not empty and holds no {RECORDS}. Choose another -o.")
             return {}
         document = json.loads(path.read_bytes())
-        rows = document["scenes"] if document["version"] == VERSION else None
-        return {str(row["name"]): dict(row) for row in rows}
+        if document["version"] != VERSION:
+            raise InputError(
+                f"{path} has version {document['version']}, this gsopt reads {VERSION}. Choose another -o."
+            )
+        return {str(row["name"]): dict(row) for row in document["scenes"]}
     except OSError as error:
         raise InputError(f"Cannot use {out}: {error.strerror}. Choose another -o.") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(
-            f"{path} is broken: {error!r}. Remove it: finished runs are evaluated again, not lost."
-        ) from error
+        raise InputError(f"{path} is broken: {error!r}. Restore it, or choose another -o.") from error
 
 
 def _is_done(record: dict[str, Any] | None, scene: SceneRun, out: Path) -> bool:

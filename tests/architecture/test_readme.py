@@ -28,7 +28,7 @@ def python_block(page: str) -> str:
 
 def verbs(page: str) -> list[str]:
     """The verbs in the first column of the table."""
-    return re.findall(r"^\| `gsopt (\w+)", page, re.MULTILINE)
+    return re.findall(r"^\| `gsopt ([\w-]+)", page, re.MULTILINE)
 
 
 def scene_rows(page: str) -> list[tuple[str, str]]:

@@ -53,11 +53,8 @@ def runs(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_broken_scene_is_listed_and_the_others_are_trained(runs: Path) -> None:
     found = records(runs)
-    assert {name: row["state"] for name, row in found.items()} == {
-        "<b>bad": "failed",
-        "chair é": "done",
-        "lamp": "done",
-    }
+    states = {"<b>bad": "failed", "chair é": "done", "lamp": "done"}
+    assert {name: row["state"] for name, row in found.items()} == states
     assert "r_1.png" in found["<b>bad"]["reason"]
     assert found["lamp"]["held_out"]
     assert found["lamp"]["threads"] == 1
