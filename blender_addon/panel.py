@@ -196,11 +196,13 @@ def draw_outcome(layout: Any, settings: Any) -> None:
 
 def draw_result(layout: Any, settings: Any) -> None:
     """Buttons for what comes after a run."""
-    if not show_job(layout, settings.job_page, "page") and not show_job(layout, settings.job_clean, "clean"):
+    jobs = [(getattr(settings, f"job_{kind}"), kind) for kind in ("page", "clean", "mesh")]
+    if not any([show_job(layout, entry, kind) for entry, kind in jobs]):
         row = layout.row(align=True)
         row.operator("gsopt.share", icon="URL")
         row.operator("gsopt.clean", icon="BRUSH_DATA")
         row.operator("gsopt.undo_clean", text="", icon="LOOP_BACK")
+        layout.operator("gsopt.mesh_proxy", icon="MESH_ICOSPHERE")
 
 
 def draw_runs(layout: Any, settings: Any) -> None:

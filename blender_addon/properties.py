@@ -140,6 +140,7 @@ class GsoptScene(bpy.types.PropertyGroup):
     job_install: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_page: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_clean: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
+    job_mesh: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_import: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
 
     run_path: StringProperty(name="Run", subtype="DIR_PATH")  # type: ignore[valid-type]

@@ -8,6 +8,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from . import (
+    mesh_proxy,
     operators_cameras,
     operators_guidance,
     operators_inspect,
@@ -29,6 +30,7 @@ CLASSES = (
     *operators_guidance.CLASSES,
     *operators_run.CLASSES,
     *operators_result.CLASSES,
+    *mesh_proxy.CLASSES,
     *operators_cameras.CLASSES,
     *operators_inspect.CLASSES,
     *panel.CLASSES,

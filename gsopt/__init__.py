@@ -19,6 +19,7 @@ _HOME = {
     "Scene": "gsopt.data.scene",
     "TrainConfig": "gsopt.config.train",
     "evaluate": "gsopt.results.evaluation",
+    "extract_mesh": "gsopt.results.mesh.extract",
     "load_scene": "gsopt.data.scene",
     "load_splats": "gsopt.formats",
     "rasterize": "gsopt.raster.api",
@@ -36,6 +37,7 @@ __all__ = [
     "Scene",
     "TrainConfig",
     "evaluate",
+    "extract_mesh",
     "load_scene",
     "load_splats",
     "rasterize",
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     from gsopt.raster.api import rasterize
     from gsopt.raster.backend import RasterSettings
     from gsopt.results.evaluation import evaluate
+    from gsopt.results.mesh.extract import extract_mesh
     from gsopt.training.loop import train
     from gsopt.training.reconstruct import reconstruct
 

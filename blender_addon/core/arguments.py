@@ -129,6 +129,11 @@ def clean(python: Path, run: Path) -> list[str]:
     return [str(python), "-m", "gsopt", "clean", str(run)]
 
 
+def mesh(python: Path, run: Path, out: Path) -> list[str]:
+    """`gsopt mesh`: a closed mesh of the run."""
+    return [str(python), "-m", "gsopt", "mesh", str(run), "-o", str(out), "--force"]
+
+
 def doctor(python: Path) -> list[str]:
     return [str(python), "-m", "gsopt", "doctor", "--json"]
 

@@ -37,7 +37,7 @@ class Job:
     """A program that was started."""
 
     kind: str
-    """train, poses, dataset, prompts, doctor, install, page or clean."""
+    """train, poses, dataset, prompts, doctor, install, page, clean or mesh."""
     folder: str
     arguments: tuple[str, ...]
     pid: int

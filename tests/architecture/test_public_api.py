@@ -19,6 +19,7 @@ PUBLIC = {
     "Scene",
     "TrainConfig",
     "evaluate",
+    "extract_mesh",
     "load_scene",
     "load_splats",
     "rasterize",

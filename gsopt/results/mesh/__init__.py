@@ -1,0 +1,1 @@
+"""Turns the splats of a finished run into a closed mesh."""
