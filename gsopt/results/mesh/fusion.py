@@ -18,7 +18,7 @@ from torch import Tensor
 from gsopt.geometry.projection import inside, project
 from gsopt.results.mesh.median_depth import DepthView
 
-TRUNCATION = 1 / 8
+TRUNCATION = 0.1
 """Share of the box's longest side over which a view's distance is followed; more of it averages over more views."""
 _CHUNK = 1 << 19
 
