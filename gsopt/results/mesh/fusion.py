@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsopt.geometry.projection import inside, project
 from gsopt.results.mesh.median_depth import DepthView
 
 TRUNCATION = 0.1
@@ -78,10 +77,7 @@ def signed_distance(
     view: DepthView, points: Float[Tensor, "M 3"], truncation: float
 ) -> tuple[Float[Tensor, "M"], Bool[Tensor, "M"]]:
     """Distance before the surface in shares of the truncation, at most 1, and True where the view sees the point."""
-    column, row, depth = project(view.camera, points)
-    shown = inside(view.camera, column, row, depth)
-    x = column.nan_to_num().long().clamp(0, view.camera.width - 1)
-    y = row.nan_to_num().long().clamp(0, view.camera.height - 1)
+    x, y, depth, shown = view.pixels(points)
     # A pixel without a surface says how far beside the surface the point lies, which falls to 0 at the outline.
     beside = view.gaps[y, x] * depth / float(view.camera.Ks[0, 0, 0])
     behind = view.depths[y, x] - depth

@@ -11,12 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gsopt._optional import require
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.projection import inside, project
 from gsopt.raster.backend import Backend, RasterSettings
 
 SLABS = 32
@@ -25,7 +26,7 @@ SLABS = 32
 
 @dataclass(frozen=True)
 class DepthView:
-    """What one camera sees of the splats."""
+    """The picture of one camera, with depths."""
 
     camera: Cameras
     depths: Float[Tensor, "H W"]
@@ -35,6 +36,15 @@ class DepthView:
     colors: Float[Tensor, "H W 3"]
     """Premultiplied."""
     alphas: Float[Tensor, "H W"]
+
+    def pixels(
+        self, points: Float[Tensor, "M 3"]
+    ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Float[Tensor, "M"], Bool[Tensor, "M"]]:
+        """Column, row and depth of each point, and True where the image has it; elsewhere the pixel is the first."""
+        column, row, depth = project(self.camera, points)
+        shown = inside(self.camera, column, row, depth)
+        x, y = (torch.where(shown, place, 0).long() for place in (column, row))
+        return x.clamp(max=self.camera.width - 1), y.clamp(max=self.camera.height - 1), depth, shown
 
 
 def depth_view(

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gsopt._optional import require
 from gsopt.formats.mesh_files import Mesh
-from gsopt.geometry.projection import inside, project
 from gsopt.results.mesh.fusion import Box
 from gsopt.results.mesh.median_depth import DepthView
 
@@ -27,8 +26,8 @@ COLOR_TOLERANCE = 4.0
 """Voxels by which a vertex may lie behind the surface that a view sees and still take its color."""
 TAUBIN_ROUNDS, TAUBIN_SHRINK, TAUBIN_SWELL = 5, 0.5, -0.53
 """Rounds of two steps: towards the mean of the neighbors, and a little more away from it."""
-HASTES = (7, 5, 3, 2)
-"""How much error each round of the decimation may take at once; less of it folds fewer faces onto each other."""
+ATTEMPTS = [(share, haste) for share in (1.0, 0.95, 0.9, 0.8) for haste in (7, 5, 3)]
+"""Shares of the faces and error that a round of the decimation may take at once, until no face folds onto another."""
 GRAY = 0.5
 PURPOSE = "A mesh"
 
@@ -74,8 +73,9 @@ def decimated(
     if len(faces) <= count:
         return vertices, faces
     simplify = require("fast_simplification", "mesh", PURPOSE).simplify
-    for haste in HASTES:
-        fewer, kept = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=count, agg=haste)
+    for share, haste in ATTEMPTS:
+        target = round(share * count)
+        fewer, kept = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=target, agg=haste)
         if is_closed(kept):
             return fewer, kept.astype(np.int64)
     return vertices, faces
@@ -103,10 +103,7 @@ def _shown(
     view: DepthView, points: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"], tolerance: float
 ) -> tuple[Float[Tensor, "V 4"], Float[Tensor, "V"]]:
     """Premultiplied color and alpha at each point, and its squared cosine to the view where that sees it, else 0."""
-    column, row, depth = project(view.camera, points)
-    shown = inside(view.camera, column, row, depth)
-    x = column.nan_to_num().long().clamp(0, view.camera.width - 1)
-    y = row.nan_to_num().long().clamp(0, view.camera.height - 1)
+    x, y, depth, shown = view.pixels(points)
     seen: Bool[Tensor, "V"] = shown & ((view.depths[y, x] - depth).abs() < tolerance)
     towards = torch.nn.functional.normalize(view.camera.centers[0] - points, dim=-1)
     facing = (towards * normals).sum(-1).clamp_min(0).square()
