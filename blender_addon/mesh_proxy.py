@@ -14,9 +14,10 @@ import bpy
 from . import splat_object
 from .core import arguments, job
 from .core.errors import InputError
+from .core.units import meters_per_unit
 from .job_results import FINISH
 from .operator_errors import WaitingOperator
-from .operators_inspect import activate, data_of, frame
+from .operators_inspect import METERS, activate, data_of, frame
 from .operators_result import finished_run
 from .operators_source import begin, refuse_two
 from .preferences import python, work_folder
@@ -58,7 +59,8 @@ def add_proxy(scene: Any, path: Path) -> Any:
         splat_object.remove(bpy, old)
     thing.name = thing.data.name = f"{run.name} proxy"
     thing[PROXY] = str(run)
-    thing.matrix_world = frame(scene.gsopt, data_of(run))
+    thing[METERS] = meters_per_unit(run)
+    thing.matrix_world = frame(scene.gsopt, data_of(run), thing[METERS])
     thing.display_type, thing.is_shadow_catcher = "WIRE", True
     thing.modifiers.new("Collision", "COLLISION")
     thing.data.materials.append(colored_material())

@@ -10,6 +10,7 @@ from mathutils import Matrix
 from . import splat_object
 from .core.cameras import View, read_views
 from .core.errors import UsageError
+from .core.units import meters_per_unit
 from .operator_errors import ReportingOperator
 from .operators_inspect import data_of, frame
 from .preferences import absolute
@@ -38,7 +39,8 @@ class GSOPT_OT_import_cameras(ReportingOperator, bpy.types.Operator):
         views = read_views(data)
         home = bpy.data.collections.new("gsopt cameras")
         context.scene.collection.children.link(home)
-        matrix = frame(settings, data)
+        scale = meters_per_unit(absolute(settings.run_path)) if settings.run_path else 1.0
+        matrix = frame(settings, data, scale)
         for view in views[:MAX_CAMERAS]:
             add_camera(home, view, matrix, settings.picture)
         return f"{min(len(views), MAX_CAMERAS)} of {len(views)} cameras"

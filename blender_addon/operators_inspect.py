@@ -16,10 +16,13 @@ from .core import dataset, statistics
 from .core.errors import InputError, UsageError
 from .core.files import read_json
 from .core.ply import write_ply
+from .core.units import meters_per_unit
 from .material import let_cycles_see_through
 from .operator_errors import ReportingOperator, WaitingOperator
 from .preferences import absolute
 
+METERS = "gsopt_meters"
+"""Custom property: the scale that an object has."""
 UPRIGHT = Matrix.Rotation(-math.pi / 2, 4, "X")
 
 
@@ -44,15 +47,16 @@ def data_of(run: Path) -> Path | None:
         return None
 
 
-def frame(settings: Any, data: Path | None) -> Matrix:
-    """From the splats' axes to the scene's."""
+def frame(settings: Any, data: Path | None, scale: float = 1.0) -> Matrix:
+    """From the splats' axes to the scene's; `scale`: meters of one of their units."""
+    meters = Matrix.Scale(scale, 4)
     if settings.up == "MINUS_Y":
-        return UPRIGHT.copy()
+        return meters @ UPRIGHT
     if settings.up == "DATASET" and data is not None:
         found = dataset.scene_from_dataset(data)
         if found is not None:
-            return Matrix(found.tolist())
-    return Matrix()
+            return meters @ Matrix(found.tolist())
+    return meters
 
 
 class GSOPT_OT_import_splats(WaitingOperator, bpy.types.Operator):
@@ -80,11 +84,12 @@ class GSOPT_OT_import_splats(WaitingOperator, bpy.types.Operator):
             raise UsageError("No splats are named. Choose a file, or attach to a run first.")
         source, replaces_live = absolute(chosen), self.from_run
         path = loading.splat_file(source)
-        matrix = frame(settings, data_of(source if source.is_dir() else path.parent))
+        scale = meters_per_unit(source)
+        matrix = frame(settings, data_of(source if source.is_dir() else path.parent), scale)
 
         def finish(target: Any, mesh: Any, summary: statistics.Summary) -> Iterator[None]:
             thing = progress_timer.add_object(target, mesh, summary, str(source), target.gsopt.display)
-            thing.matrix_world = matrix
+            thing.matrix_world, thing[METERS] = matrix, scale
             live = progress_timer.live_object(target) if replaces_live else None
             if live is not None:
                 splat_object.remove(bpy, live)

@@ -245,6 +245,7 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
             draw_colors(layout, context)
             draw_summary(layout, active)
             draw_filters(layout, settings)
+            draw_scale(layout, settings)
 
 
 def draw_display(layout: Any, thing: Any) -> None:
@@ -296,6 +297,14 @@ def draw_filters(layout: Any, settings: Any) -> None:
     row.operator("gsopt.show_all")
     row.operator("gsopt.delete_hidden", text="Delete")
     box.operator("gsopt.export", icon="EXPORT")
+
+
+def draw_scale(layout: Any, settings: Any) -> None:
+    """True size from two splats that are selected in Edit Mode."""
+    if not show_job(layout, settings.job_measure, "measure"):
+        row = layout.row(align=True)
+        row.prop(settings, "known_length")
+        row.operator("gsopt.set_scale", text="", icon="DRIVER_DISTANCE")
 
 
 CLASSES = (

@@ -22,7 +22,7 @@ from .job_results import FINISH
 
 PAUSE, BUSY = 0.4, 0.02
 """Seconds between two looks, and while splats are handed over."""
-KINDS = ("dataset", "poses", "masks", "prompts", "doctor", "install", "page", "clean", "mesh")
+KINDS = ("dataset", "poses", "masks", "prompts", "doctor", "install", "page", "clean", "mesh", "measure")
 OPEN = ("waiting", "running")
 """States of a run that is going on."""
 LIVE = "gsopt_live"

@@ -140,6 +140,14 @@ class GsoptScene(bpy.types.PropertyGroup):
     job_install: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_page: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_clean: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
+    job_measure: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
+    known_length: FloatProperty(  # type: ignore[valid-type]
+        name="Known Length",
+        default=1.0,
+        min=1e-6,
+        unit="LENGTH",
+        description="True length between the two chosen splats",
+    )
     job_mesh: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
     job_import: PointerProperty(type=GsoptJob)  # type: ignore[valid-type]
 

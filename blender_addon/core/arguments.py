@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,6 +133,12 @@ def clean(python: Path, run: Path) -> list[str]:
 def mesh(python: Path, run: Path, out: Path) -> list[str]:
     """`gsopt mesh`: a closed mesh of the run."""
     return [str(python), "-m", "gsopt", "mesh", str(run), "-o", str(out), "--force"]
+
+
+def measure(python: Path, run: Path, start: Sequence[float], end: Sequence[float], length: float) -> list[str]:
+    """`gsopt measure`: the scale of the run from a known length, meters."""
+    points = [f"--{name}={','.join(f'{x:.9g}' for x in point)}" for name, point in (("from", start), ("to", end))]
+    return [str(python), "-m", "gsopt", "measure", str(run), *points, "--unit-length", f"{length:.9g}m"]
 
 
 def doctor(python: Path) -> list[str]:

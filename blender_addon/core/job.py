@@ -37,7 +37,7 @@ class Job:
     """A program that was started."""
 
     kind: str
-    """train, poses, dataset, prompts, doctor, install, page, clean or mesh."""
+    """train, poses, dataset, prompts, doctor, install, page, clean, mesh or measure."""
     folder: str
     arguments: tuple[str, ...]
     pid: int

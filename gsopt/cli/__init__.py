@@ -24,6 +24,7 @@ VERBS = {
     "export": "write splats in another format",
     "clean": "leave out splats that no input view needs",
     "mesh": "turn the splats of a run into a closed mesh",
+    "measure": "measure lengths, and give a run its scale",
     "view": "look at a run or a splat file in the browser",
     "finetune": "train a diffusion prior on scenes of your own",
     "bench": "measure gsopt on this machine",

@@ -57,6 +57,7 @@ def clean_run(flags: Flags) -> int:
     from gsopt.formats import save_splats
     from gsopt.results import clean, clean_files
     from gsopt.results.finished_run import open_run
+    from gsopt.results.measure import units_of
 
     run = open_run(flags.source)
     views = with_refined_poses(load_scene(run.config.data), run.path).train
@@ -68,7 +69,8 @@ def clean_run(flags: Flags) -> int:
     if flags.dry_run:
         return 0
     if flags.out is not None:
-        save_splats(flags.out, run.gaussians.select(keep), antialiased=run.config.antialiased)
+        units = units_of(flags.source)
+        save_splats(flags.out, run.gaussians.select(keep), antialiased=run.config.antialiased, units=units)
     elif not bool(keep.all()):
         clean_files.replace_splats(run, keep)
         print(f"{flags.source}/splat.ply replaced; `gsopt clean {flags.source} --undo` brings it back")
@@ -79,13 +81,16 @@ def clean_file(flags: Flags) -> int:
     """Decide by the splats alone."""
     from gsopt.formats import is_antialiased, load_splats, save_splats
     from gsopt.results import clean
+    from gsopt.results.measure import units_of
 
     gaussians = load_splats(flags.source)
     found = clean.findings_without_views(gaussians, flags.box)
     report(found, len(gaussians))
     if flags.out is not None and not flags.dry_run:
         keep = clean.kept(found, len(gaussians))
-        save_splats(flags.out, gaussians.select(keep), antialiased=is_antialiased(flags.source))
+        save_splats(
+            flags.out, gaussians.select(keep), antialiased=is_antialiased(flags.source), units=units_of(flags.source)
+        )
     return 0
 
 

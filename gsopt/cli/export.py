@@ -48,13 +48,15 @@ def main(argv: Sequence[str]) -> int:
         raise UsageError(f"`--out` must not exist yet, got {out}. Add --force to replace it, or choose another name.")
     if not out.parent.is_dir():
         raise InputError(f"`--out` must lie in a folder that exists, got {out.parent}. Create it first.")
+    from gsopt.results.measure import units_of
+
     source = splats_in(flags.source)
     antialiased = is_antialiased(source)
     gaussians = load_splats(source, strict=flags.strict)
     if suffix == PAGE:
         write_page(flags.source, gaussians, out, antialiased)
     else:
-        save_splats(out, gaussians, antialiased=antialiased)
+        save_splats(out, gaussians, antialiased=antialiased, units=units_of(flags.source))
         note_losses(suffix, gaussians.sh_degree, antialiased)
     print(f"{out}: {len(gaussians):,} splats, {out.stat().st_size:,} bytes")
     return 0

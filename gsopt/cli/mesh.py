@@ -39,6 +39,7 @@ def main(argv: Sequence[str]) -> int:
     from gsopt.formats import suffix_of
     from gsopt.formats.mesh_files import SUFFIXES, save_mesh
     from gsopt.results.finished_run import open_run
+    from gsopt.results.measure import units_of
     from gsopt.results.mesh.extract import extract_mesh
 
     suffix_of(flags.out, SUFFIXES)
@@ -48,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
         raise InputError(f"`--out` must lie in a folder that exists, got {flags.out.parent}. Create it first.")
     run = open_run(flags.run, threads=flags.threads)
     mesh = extract_mesh(run, faces=flags.faces, voxels=flags.voxels, box=flags.box)
-    save_mesh(flags.out, mesh)
+    save_mesh(flags.out, mesh, units_of(flags.run))
     size = flags.out.stat().st_size
     print(f"{flags.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {size:,} bytes")
     return 0

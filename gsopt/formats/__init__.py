@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsopt.errors import InputError
+from gsopt.formats.units import UNKNOWN, Units
 
 if TYPE_CHECKING:
     from gsopt.gaussians import Gaussians
@@ -35,23 +36,25 @@ def suffix_of(path: Path, known: tuple[str, ...] = SUFFIXES) -> str:
     raise InputError(f"{path} must end in one of {', '.join(known)}, got {path.suffix!r}. Rename it or choose one.")
 
 
-def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased: bool = False) -> None:
+def save_splats(
+    path: str | PathLike[str], gaussians: Gaussians, *, antialiased: bool = False, units: Units = UNKNOWN
+) -> None:
     """Write `gaussians` in the format that the suffix of `path` names; whole file or nothing.
 
     `antialiased`: the splats were optimized with the 2D filter of Mip-Splatting; recorded by formats that can (.ply,
-    .spz, .sog). Raises InputError for a row that is not finite, a rotation of length zero, a full disk or an unknown
-    suffix.
+    .spz, .sog). `units`: scale and origin, which .ply, .compressed.ply, .sog and .glb carry. Raises InputError for a
+    row that is not finite, a rotation of length zero, a full disk or an unknown suffix.
     """
     path = Path(path)
     match suffix_of(path):
         case ".ply":
             from gsopt.formats.ply import save_ply
 
-            save_ply(path, gaussians, antialiased=antialiased)
+            save_ply(path, gaussians, antialiased=antialiased, units=units)
         case ".compressed.ply":
             from gsopt.formats.compressed_ply import save_compressed_ply
 
-            save_compressed_ply(path, gaussians)
+            save_compressed_ply(path, gaussians, units=units)
         case ".splat":
             from gsopt.formats.splat import save_splat
 
@@ -63,11 +66,11 @@ def save_splats(path: str | PathLike[str], gaussians: Gaussians, *, antialiased:
         case ".sog":
             from gsopt.formats.sog import save_sog
 
-            save_sog(path, gaussians, antialiased=antialiased)
+            save_sog(path, gaussians, antialiased=antialiased, units=units)
         case ".glb":
             from gsopt.formats.gltf import save_glb
 
-            save_glb(path, gaussians)
+            save_glb(path, gaussians, units=units)
 
 
 def load_splats(path: str | PathLike[str], *, strict: bool = False) -> Gaussians:

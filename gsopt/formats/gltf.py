@@ -25,6 +25,7 @@ from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Docu
 from gsopt.formats.glb_splats import EXTENSION, Accessor, Primitive, splat_primitives
 from gsopt.formats.linear_color import linear_from_srgb, srgb_from_linear_color
 from gsopt.formats.placement import placed
+from gsopt.formats.units import UNKNOWN, Units
 from gsopt.formats.validation import MAX_SH_DEGREE, log_scales, logit, scales, storable
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
@@ -38,7 +39,7 @@ _OPACITY_MARGIN = 2.0**-24
 """Least distance of a float32 below 1 from it: opacities keep it from 0 and 1, so that their logits are finite."""
 
 
-def save_glb(path: Path, gaussians: Gaussians) -> None:
+def save_glb(path: Path, gaussians: Gaussians, *, units: Units = UNKNOWN) -> None:
     """Write one primitive of points; whole file or nothing, 4 GiB at most (about 17 million splats of degree 3).
 
     Reading back differs by at most: means and spherical harmonics 0; log-scales 1e-5 within ±87; opacity 1e-7; each
@@ -48,7 +49,7 @@ def save_glb(path: Path, gaussians: Gaussians) -> None:
         raise InputError(f"{path}: a .glb must hold at least one splat, got 0. Use .ply.")
     gaussians = with_flipped_axes(storable(gaussians, path), LEFT_UP_FORWARD)
     attributes = list(_attributes(gaussians))
-    text = json.dumps(_document(attributes, gaussians), separators=(",", ":")).encode()
+    text = json.dumps(_document(attributes, units), separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     length = sum(tensor.numel() * tensor.element_size() for _, tensor in attributes)
     total = HEADER.size + 2 * CHUNK.size + len(text) + length
@@ -77,7 +78,7 @@ def _attributes(gaussians: Gaussians) -> Iterator[tuple[str, Tensor]]:
             yield f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}", gaussians.shN[:, degree**2 - 1 + order]
 
 
-def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dict[str, object]:
+def _document(attributes: list[tuple[str, Tensor]], units: Units) -> dict[str, object]:
     views: list[dict[str, object]] = []
     accessors: list[dict[str, object]] = []
     offset = 0
@@ -106,7 +107,7 @@ def _document(attributes: list[tuple[str, Tensor]], gaussians: Gaussians) -> dic
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, **({"extras": units.notes()} if units.notes() else {})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

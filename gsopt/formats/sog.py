@@ -24,6 +24,7 @@ from gsopt.errors import InputError, shortened
 from gsopt.formats import sog_codes as codes
 from gsopt.formats.compression import check_budget
 from gsopt.formats.files import opened, replacing
+from gsopt.formats.units import UNKNOWN, Units
 from gsopt.formats.validation import BANDS, storable
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.morton import morton_order
@@ -39,7 +40,7 @@ _TIME = (1980, 1, 1, 0, 0, 0)
 Pixels = NDArray[np.uint8]
 
 
-def save_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
+def save_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False, units: Units = UNKNOWN) -> None:
     """Write a .sog with the splats in Morton order; needs no other file.
 
     Reading back differs by at most: means half of 1/65535 of their extent in sign(x) ln(1 + |x|); opacity 1/255; each
@@ -53,6 +54,7 @@ def save_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> 
     images, meta = codes.encode(gaussians)
     meta |= {"asset": {"generator": f"gsopt {__version__}"}}
     meta |= {"model": "antialiased"} if antialiased else {}
+    meta |= {"gsopt": units.notes()} if units.notes() else {}
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(META, _TIME), json.dumps(meta, separators=(",", ":")))
         for name, image in images.items():
@@ -74,9 +76,14 @@ def load_sog(path: Path) -> Gaussians:
 
 def sog_antialiased(path: Path) -> bool:
     """True when the file records that its splats were optimized with the 2D filter of Mip-Splatting."""
+    meta = sog_meta(path)
+    return meta.get("model") == "antialiased" or meta.get("antialias") is True
+
+
+def sog_meta(path: Path) -> Mapping[str, Any]:
+    """The meta.json of a .sog."""
     with opened(path) as (file, _), _archive(file, path) as archive:
-        meta = _meta(archive, path)
-        return meta.get("model") == "antialiased" or meta.get("antialias") is True
+        return _meta(archive, path)
 
 
 def _archive(file: BinaryIO, path: Path) -> zipfile.ZipFile:

@@ -33,3 +33,14 @@ def fails_with(said: str, operator: Any, **settings: Any) -> None:
 
 def event(kind: str, **fields: Any) -> str:
     return json.dumps({"v": 1, "seq": 0, "kind": kind, "time": 1.8e9, **fields}) + "\n"
+
+
+def stand_in(folder: Path, script: str) -> Path:
+    """A program that is called as gsopt's interpreter would be."""
+    import bpy
+
+    program = folder / "stand-in python"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    bpy.context.preferences.addons["blender_addon"].preferences.interpreter = str(program)
+    return program

@@ -81,7 +81,7 @@ def test_an_empty_file_draws(panel: Any) -> None:
 
 
 def test_work_that_goes_on_draws_with_its_progress(panel: Any) -> None:
-    for kind in ("dataset", "poses", "prompts", "page", "clean", "mesh", "import"):
+    for kind in ("dataset", "poses", "prompts", "page", "clean", "mesh", "measure", "import"):
         entry = getattr(panel, f"job_{kind}")
         entry.state, entry.share, entry.message = "RUNNING", 0.5, f"half of the {kind}"
     panel.run_status, panel.run_path = "waiting", "/runs/a"

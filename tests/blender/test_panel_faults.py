@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from in_panel import event, fails_with
+from in_panel import event, fails_with, stand_in
 from job_records import HOSTILE_RECORDS, record_of
 from made_splats import random_splats
 
@@ -86,17 +86,6 @@ def test_a_program_that_dies_at_once_is_told(panel: Any, tmp_path: Path) -> None
     bpy.context.preferences.addons["blender_addon"].preferences.interpreter = str(wrong)
     fails_with("There is no scene in it", bpy.ops.gsopt.launch)
     assert panel.run_status == "error"
-
-
-def stand_in(folder: Path, script: str) -> Path:
-    """A program that is called as gsopt's interpreter would be."""
-    import bpy
-
-    program = folder / "stand-in python"
-    program.write_text(f"#!/bin/sh\n{script}\n")
-    program.chmod(0o755)
-    bpy.context.preferences.addons["blender_addon"].preferences.interpreter = str(program)
-    return program
 
 
 def test_a_killed_run_is_told_and_can_go_on(panel: Any, tmp_path: Path) -> None:
@@ -300,56 +289,3 @@ def test_a_run_is_shared_and_cleaned_or_the_reason_is_told(panel: Any, tmp_path:
     (run / "splat.before-clean.ply").write_bytes(b"before")
     bpy.ops.gsopt.undo_clean()
     assert (run / "splat.ply").read_bytes() == b"before"
-
-
-PYRAMID = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-property uchar red
-property uchar green
-property uchar blue
-element face 4
-property list uchar int vertex_indices
-end_header
-0 0 0 255 0 0
-1 0 0 0 255 0
-0 1 0 0 0 255
-0 0 2 128 128 128
-3 0 2 1
-3 0 1 3
-3 1 2 3
-3 2 0 3
-"""
-
-
-def test_a_mesh_proxy_stands_for_the_splats_or_the_reason_is_told(panel: Any, tmp_path: Path) -> None:
-    """`-m gsopt mesh RUN -o OUT --force`; a second proxy of the same run replaces the first."""
-    import bpy
-
-    fails_with("no finished run", bpy.ops.gsopt.mesh_proxy)
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "splat.ply").write_bytes(b"splats")
-    (tmp_path / "pyramid").write_text(PYRAMID)
-    panel.run_path, panel.up = str(run), "MINUS_Y"
-    stand_in(tmp_path, "echo 'gsopt: There is no surface.'; exit 3")
-    fails_with("There is no surface", bpy.ops.gsopt.mesh_proxy)
-    stand_in(tmp_path, 'echo nothing > "$6"')
-    fails_with("mesh.ply", bpy.ops.gsopt.mesh_proxy)
-    stand_in(tmp_path, f'cp "{tmp_path}/pyramid" "$6"')
-    for _ in range(2):
-        bpy.ops.gsopt.mesh_proxy()
-    proxies = [thing for thing in bpy.context.scene.objects if thing.get("gsopt_proxy")]
-    assert len(proxies) == 1
-    proxy = proxies[0]
-    assert proxy.is_shadow_catcher
-    assert proxy.display_type == "WIRE"
-    assert [modifier.type for modifier in proxy.modifiers] == ["COLLISION"]
-    assert [polygon.loop_total for polygon in proxy.data.polygons] == [3] * 4
-    top = proxy.matrix_world @ proxy.data.vertices[1].co
-    assert [round(x, 5) for x in top] == [1, 0, 0]
-    tip = proxy.matrix_world @ proxy.data.vertices[3].co
-    assert [round(x, 5) for x in tip] == [0, 2, 0], "splats and proxy are turned alike"
