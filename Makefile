@@ -20,7 +20,7 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize test-interop test-sd21 test-llm test-blender test-blender-gui blender-extension
+.PHONY: demo test lint bench stress sanitize test-interop test-sd21 test-llm test-ray test-blender test-blender-gui blender-extension
 
 demo: $(VENV)/.for-demo
 	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
@@ -76,6 +76,11 @@ sanitize: $(VENV)/.for-test
 # A guided step by Stable Diffusion 2.1's networks at their real size, random weights: 2.6 GB of disk, 8 GB of memory.
 test-sd21: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_SD21=full $(PY) -m pytest tests/sds/test_real_size.py
+
+# Three nodes of Ray on this machine, one of them killed; `make test` skips these, for Ray takes 240 MB.
+test-ray: $(VENV)/.for-test
+	$(PIP) 'ray[client]'
+	OMP_NUM_THREADS=1 $(PY) -m pytest tests/farm
 
 # A real server of the OpenAI-compatible protocol, with a random model and with a small real one (93 MB); up to an hour.
 # Not the package's own requirements: one of them compiles llama.cpp, and transformers reads its file without.

@@ -30,6 +30,8 @@ class Job:
     """New folder that the worker makes; it appears whole or not at all. A job without is done by its answer."""
     inputs: tuple[Path, ...] = ()
     """Files and folders that the job reads."""
+    writes: tuple[Path, ...] = ()
+    """Folders that the job writes in place, and that its machine must therefore see."""
     cpus: int = 1
     memory: int | None = None
     """Bytes that the worker and its children may hold; ended beyond."""
@@ -39,11 +41,6 @@ class Job:
     """Ends the worker after the job, so that the next one gets a new process."""
     environment: Mapping[str, str] = field(default_factory=dict)
     """Set for the worker, such as the instruction set that the bits depend on."""
-
-    @property
-    def partial(self) -> Path | None:
-        """Sibling of `folder` that the worker writes."""
-        return None if self.folder is None else self.folder.with_name(f"{PARTIAL}{self.folder.name}")
 
 
 @dataclass(frozen=True)
@@ -83,6 +80,11 @@ class Farm(Protocol):
         ...
 
 
+def partial_of(folder: Path, token: str) -> Path:
+    """Sibling of a result's folder that one attempt writes."""
+    return folder.with_name(f"{PARTIAL}{token}-{folder.name}")
+
+
 def relocated(value: Any, places: Mapping[Path, Path]) -> Any:
     """A JSON-ready value with every path at or below a key of `places` moved there."""
     if isinstance(value, Mapping):
@@ -97,30 +99,29 @@ def relocated(value: Any, places: Mapping[Path, Path]) -> Any:
     return value
 
 
-def keep_result(outcome: Outcome) -> Outcome:
+def keep_result(outcome: Outcome, partial: Path) -> Outcome:
     """Renames the partial folder of a finished job to its name and removes that of any other."""
     job = outcome.job
-    if job.folder is None or job.partial is None:
+    if job.folder is None:
         return outcome
     if outcome.ending == "done":
         try:
-            job.partial.rename(job.folder)
+            partial.rename(job.folder)
             return outcome
         except OSError as error:
             message = f"Its result cannot be renamed to {job.folder}: {error.strerror}."
             outcome = Outcome(job, "failed", None, message, outcome.output, outcome.host, outcome.seconds)
-    shutil.rmtree(job.partial, ignore_errors=True)
+    shutil.rmtree(partial, ignore_errors=True)
     return outcome
 
 
 def make_room(job: Job) -> None:
     """Makes the place of a job's result. Raises InputError where that cannot be, or where something is already."""
-    if job.folder is None or job.partial is None:
+    if job.folder is None:
         return
     if job.folder.exists() or job.folder.is_symlink():
         raise InputError(f"The output folder must be new, but {job.folder} exists. Remove it or choose another.")
     try:
         job.folder.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(job.partial, ignore_errors=True)
     except OSError as error:
         raise InputError(f"Cannot make {job.folder.parent}: {error.strerror}. Choose another folder.") from error

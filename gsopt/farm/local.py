@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report
-from gsopt.farm.job import Job, Outcome, keep_result, make_room, relocated
+from gsopt.farm.job import Job, Outcome, keep_result, make_room, partial_of, relocated
 from gsopt.farm.worker import Worker
 
 
@@ -70,9 +71,10 @@ class LocalFarm:
                 make_room(job)
             except InputError as error:
                 return Outcome(job, "failed", error=str(error))
-            places = {job.folder: job.partial} if job.folder and job.partial else {}
+            partial = partial_of(job.folder, str(os.getpid())) if job.folder else None
+            places = {job.folder: partial} if job.folder and partial else {}
             outcome = worker.do(job, relocated(job.request, places), lambda: self._is_canceled(job))
-        return keep_result(outcome)
+        return keep_result(outcome, partial) if partial else outcome
 
     def _is_canceled(self, job: Job) -> bool:
         return self._closed or job.name in self._canceled

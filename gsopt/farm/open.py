@@ -20,6 +20,11 @@ def open_farm(name: str, cpus: int, memory: int | None = None) -> Farm:
         count = int(match[1] or cpus)
         check.within("--farm", count, 1, MAX_CPUS, "Give the cores to use, as local:4.")
         return LocalFarm(count, memory)
+    remote = re.fullmatch(r"ray(?:://([^/\s]+:\d{1,5}))?", name)
+    if remote:
+        from gsopt.farm.ray_farm import RayFarm
+
+        return RayFarm(remote[1] or "")
     raise UsageError(f"`--farm` must be local, local:CORES, ray or ray://HOST:PORT, got {name!r}. Pick one of these.")
 
 

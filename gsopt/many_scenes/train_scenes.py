@@ -63,9 +63,7 @@ def _opened(out: Path) -> dict[str, dict[str, Any]]:
             return {}
         document = json.loads(path.read_bytes())
         if document["version"] != VERSION:
-            raise InputError(
-                f"{path} has version {document['version']}, this gsopt reads {VERSION}. Choose another -o."
-            )
+            raise InputError(f"{path} has version {document['version']}, got to be {VERSION}. Choose another -o.")
         return {str(row["name"]): dict(row) for row in document["scenes"]}
     except OSError as error:
         raise InputError(f"Cannot use {out}: {error.strerror}. Choose another -o.") from error
@@ -86,7 +84,8 @@ def _job(scene: SceneRun, out: Path, limits: Limits) -> Job:
         scene.name,
         serving("gsopt.cli.serve_jobs"),
         {"arguments": words, "picture_of": str(run), "picture": str(run / PICTURE)},
-        inputs=(scene.data, out.absolute()),
+        inputs=(scene.data,),
+        writes=(out.absolute(),),
         cpus=limits.threads,
         memory=limits.memory,
         seconds=limits.seconds,

@@ -175,12 +175,12 @@ def test_a_killed_driver_loses_no_finished_job_and_leaves_no_worker(tmp_path: Pa
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "mine.txt").write_text("mine")
-    (tmp_path / f"{PARTIAL}b").mkdir()
-    (tmp_path / f"{PARTIAL}b" / "of a killed run").touch()
+    (tmp_path / f"{PARTIAL}1-b").mkdir()
+    (tmp_path / f"{PARTIAL}1-b" / "of a killed run").touch()
     found = by_name(LocalFarm(1), job("a", folder=tmp_path / "a"), job("b", folder=tmp_path / "b"))
     assert found["a"].ending == "failed"
     assert "must be new" in found["a"].error
-    assert list(files(tmp_path)) == ["a/mine.txt", "b/below/text.txt"]
+    assert list(files(tmp_path)) == [f"{PARTIAL}1-b/of a killed run", "a/mine.txt", "b/below/text.txt"]
 
 
 def test_a_full_disk_is_an_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
