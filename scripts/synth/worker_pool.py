@@ -31,7 +31,8 @@ def render_job(item: Item, settings: Settings, seed: int, out: Path, time_limit:
     request = {"item": asdict(item) | {"mesh": str(mesh)}, "settings": asdict(named), "seed": seed, "out": str(whole)}
     beside = mesh if mesh.suffix.lower() in ONE_FILE else mesh.parent
     inputs = (beside, SCRIPT.parent, *files.values())
-    return Job(item.id, worker_command(), request, whole, inputs, max(1, settings.threads), memory, time_limit)
+    limits = {"cpus": max(1, settings.threads), "memory": memory, "seconds": time_limit}
+    return Job(item.id, worker_command(), request, whole, inputs, **limits)
 
 
 def reason(outcome: Outcome) -> str | None:
