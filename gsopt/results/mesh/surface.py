@@ -26,8 +26,8 @@ COLOR_TOLERANCE = 4.0
 """Voxels by which a vertex may lie behind the surface that a view sees and still take its color."""
 TAUBIN_ROUNDS, TAUBIN_SHRINK, TAUBIN_SWELL = 5, 0.5, -0.53
 """Rounds of two steps: towards the mean of the neighbors, and a little more away from it."""
-ATTEMPTS = [(share, haste) for share in (1.0, 0.95, 0.9, 0.8) for haste in (7, 5, 3)]
-"""Shares of the faces and error that a round of the decimation may take at once, until no face folds onto another."""
+HASTES = (7, 5, 3, 2)
+"""How much error a round of the decimation may take at once; less of it folds fewer faces onto each other."""
 GRAY = 0.5
 PURPOSE = "A mesh"
 
@@ -73,12 +73,34 @@ def decimated(
     if len(faces) <= count:
         return vertices, faces
     simplify = require("fast_simplification", "mesh", PURPOSE).simplify
-    for share, haste in ATTEMPTS:
-        target = round(share * count)
-        fewer, kept = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=target, agg=haste)
+    for haste in HASTES:
+        found = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=count, agg=haste)
+        fewer, kept = unfolded(found[0], found[1].astype(np.int64))
         if is_closed(kept):
-            return fewer, kept.astype(np.int64)
+            return fewer, kept
     return vertices, faces
+
+
+def unfolded(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Without faces that lie on one another, and with sheets that touch along an edge taken apart there."""
+    components = require("scipy.sparse.csgraph", "mesh", PURPOSE).connected_components
+    matrix = require("scipy.sparse", "mesh", PURPOSE).coo_array
+    _, place, count = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    faces = faces[count[place.reshape(-1)] == 1]
+    begin, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    ahead, back = begin * len(vertices) + end, end * len(vertices) + begin
+    order = np.argsort(ahead, kind="stable")
+    once = np.unique(ahead, return_counts=True)
+    single = once[0][once[1] == 1]
+    good = np.flatnonzero(np.isin(ahead, single) & np.isin(back, single))  # corners at which a sound edge begins
+    other = order[np.searchsorted(ahead, back[good], sorter=order)]  # and those at which its way back begins
+    after = np.arange(len(ahead)).reshape(-1, 3)[:, [1, 2, 0]].reshape(-1)
+    pairs = np.stack([np.concatenate([good, after[good]]), np.concatenate([after[other], other])])
+    links = matrix((np.ones(pairs.shape[1], np.int8), pairs), shape=(len(ahead), len(ahead)))
+    number, label = components(links, directed=False)
+    moved = np.zeros((number, 3), np.float32)
+    moved[label] = vertices[begin]
+    return moved, label.reshape(-1, 3).astype(np.int64)
 
 
 def is_closed(faces: NDArray[np.integer]) -> bool:

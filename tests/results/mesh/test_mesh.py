@@ -194,6 +194,21 @@ def test_floaters_and_hollows_are_left_out() -> None:
     assert float(tidy[1, 1, 1]) > 0
 
 
+def test_sheets_that_touch_are_taken_apart_and_folded_faces_go() -> None:
+    """Two pyramids that share an edge, and a flap: four faces along one edge before, two along every edge after."""
+    first = pyramid().faces.numpy()
+    names = np.array([0, 1, 4, 5])  # the second has the first's edge 0-1
+    faces = np.concatenate([first, names[first], [[2, 3, 4], [2, 4, 3]]])
+    vertices = np.concatenate([pyramid().vertices.numpy(), [[0, -1, 0], [0, 0, -2]]]).astype(np.float32)
+    assert not surface.is_closed(faces)
+    moved, apart = surface.unfolded(vertices, faces)
+    assert surface.is_closed(apart)
+    assert len(apart) == 8
+    assert len(moved) == 8
+    corners = {tuple(sorted(map(tuple, vertices[face].tolist()))) for face in faces[:8]}
+    assert {tuple(sorted(map(tuple, moved[face].tolist()))) for face in apart} == corners
+
+
 def test_voxels_that_nobody_sees_are_inside_an_object_and_outside_of_a_scene() -> None:
     box = box_around(torch.full((3,), -1.0), torch.full((3,), 1.0), 16)
     assert bool((fused([], box, solid=True) < 0).all())
