@@ -20,6 +20,7 @@ from gsopt.geometry.camera_paths import ellipse_path, interpolated_path, orbit_p
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.results.camera_path_file import read_camera_path
 from gsopt.results.video import safe_name, save_stills, save_video
 
 NamedCamera = tuple[str, Cameras]
@@ -99,7 +100,7 @@ def to_bytes(colors: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
 
 
 def cameras_along(run: FinishedRun, path: str, count: int, longest: int | None = None) -> list[NamedCamera]:
-    """Cameras of `--path`: the input or held-out views themselves, or `count` cameras along a path.
+    """Cameras of `--path`: the input or held-out views, `count` cameras along a path, or those of a file (.json).
 
     `longest`: length of the longer side after scaling, px. Raises InputError when nothing was held out.
     """
@@ -111,6 +112,8 @@ def cameras_along(run: FinishedRun, path: str, count: int, longest: int | None =
                 f"{run.path} held out no views to render, got 0. Choose another --path, or train with --eval."
             )
         shots = [(safe_name(index, view.name), view.camera) for index, view in enumerate(views)]
+    elif path.endswith(".json"):
+        shots = [(f"{i:04d}", camera) for i, camera in enumerate(read_camera_path(Path(path), scene.origin))]
     else:
         cameras = Cameras.cat([view.camera.resized(*_first_size(scene)) for view in scene.train])
         path_cameras = camera_path(run, cameras, path, count)

@@ -27,7 +27,7 @@ COLOR_TOLERANCE = 4.0
 TAUBIN_ROUNDS, TAUBIN_SHRINK, TAUBIN_SWELL = 5, 0.5, -0.53
 """Rounds of two steps: towards the mean of the neighbors, and a little more away from it."""
 HASTES = (7, 5, 3, 2)
-"""How much error a round of the decimation may take at once; less of it folds fewer faces onto each other."""
+"""Errors that a round of the decimation may take at once; less of it folds fewer faces onto each other."""
 GRAY = 0.5
 PURPOSE = "A mesh"
 

@@ -1,0 +1,84 @@
+"""Camera paths leave as nerfstudio's JSON and come back as the same cameras; a broken file is one clear line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from finished_runs import make_run, ring
+
+from gsopt.cli import main
+from gsopt.errors import InputError
+from gsopt.results.camera_path_file import read_camera_path, write_camera_path
+
+ORIGIN = (1000.0, -2000.0, 5.0)
+
+
+def document() -> dict:
+    pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1]
+    return {"render_width": 8, "render_height": 6, "camera_path": [{"camera_to_world": pose, "fov": 50.0}]}
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), ORIGIN])
+def test_a_path_comes_back_as_the_same_cameras(tmp_path: Path, origin: tuple[float, float, float]) -> None:
+    shots = ring(5)
+    write_camera_path(tmp_path / "p.json", [shots[i] for i in range(5)], 24.0, origin)
+    found = read_camera_path(tmp_path / "p.json", origin)
+    assert len(found) == 5
+    for row, camera in enumerate(found):
+        assert torch.allclose(camera.viewmats[0], shots.viewmats[row], atol=1e-5)
+        assert torch.allclose(camera.Ks[0], shots.Ks[row], atol=1e-3)
+        assert (camera.width, camera.height) == (shots.width, shots.height)
+
+
+def test_the_file_says_what_nerfstudio_reads(tmp_path: Path) -> None:
+    """A camera at z = 3 that looks down the z axis, as OpenGL's do, with half the height at 3 tan(25 degrees)."""
+    (tmp_path / "p.json").write_text(json.dumps(document()))
+    camera = read_camera_path(tmp_path / "p.json")[0]
+    assert camera.centers[0].tolist() == [0, 0, 3]
+    assert camera.forwards[0].tolist() == [0, 0, -1]
+    assert float(camera.Ks[0, 1, 1]) == pytest.approx(3 / 0.4663077, rel=1e-5)
+
+
+def test_a_run_is_rendered_along_a_file_that_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, path = make_run(tmp_path), tmp_path / "path.json"
+    assert main(["render", str(run), "--path", "orbit", "--frames", "3", "-o", str(path)]) == 0
+    assert "3 cameras" in capsys.readouterr().out
+    for name, source in (("a", "orbit"), ("b", str(path))):
+        assert main(["render", str(run), "--path", source, "--frames", "3", "-o", str(tmp_path / name)]) == 0
+    pictures = [sorted((tmp_path / name).glob("*.png")) for name in "ab"]
+    assert [picture.name for picture in pictures[0]] == [picture.name for picture in pictures[1]]
+    assert len(pictures[0]) == 3
+    capsys.readouterr()
+    assert main(["render", str(run), "-o", str(path)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["render", str(run), "--path", "spiral"]) == 2
+    assert "turntable" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"render_width": 0},
+        {"render_height": 1e9},
+        {"render_width": True},
+        {"camera_path": []},
+        {"camera_path": {}},
+        {"camera_path": [3]},
+        {"camera_path": [{"fov": 50}]},
+        {"camera_path": [{"fov": 50, "camera_to_world": [1] * 16}]},
+        {"camera_path": [{"fov": 50, "camera_to_world": [float("nan")] * 16}]},
+        {"camera_path": [{"fov": 50, "camera_to_world": [10**400] * 16}]},
+        {"camera_path": [{**document()["camera_path"][0], "fov": 180}]},
+        {"camera_type": "equirectangular"},
+    ],
+)
+def test_a_broken_file_is_bad_data_in_one_line(tmp_path: Path, capsys, change: dict) -> None:
+    path = tmp_path / "p.json"
+    path.write_text(json.dumps(document() | change))
+    with pytest.raises(InputError, match=r"p\.json"):
+        read_camera_path(path)
+    assert main(["render", str(make_run(tmp_path)), "--path", str(path)]) == 3
+    assert len(capsys.readouterr().err.splitlines()) == 1
