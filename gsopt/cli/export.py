@@ -22,6 +22,8 @@ RECORDS_ANTIALIASED = (".ply", ".spz", ".sog")
 
 
 PAGE = ".html"
+MEASURED_VIEWS = 24
+"""Most views of each kind that --decimate is measured on."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Flags:
     page with viewer, input cameras and camera path, which needs no network."""
     force: bool = False
     """Replace OUT if it exists."""
+    decimate: str = "100%"
+    """Keep this share of the splats by merging neighbors, as 25%; a run prints what that costs its views."""
     strict: bool = False
     """Refuse a file with a splat that cannot be drawn (NaN, no rotation) instead of leaving that splat out."""
 
@@ -43,7 +47,9 @@ def main(argv: Sequence[str]) -> int:
     """Convert, print the size of the file and return 0."""
     flags = tyro.cli(Flags, prog="gsopt export", args=list(argv))
     out = flags.out
-    suffix = suffix_of(out, (*SUFFIXES, PAGE))
+    suffix, share = suffix_of(out, (*SUFFIXES, PAGE)), share_of(flags.decimate)
+    if suffix == PAGE and share < 1:
+        raise UsageError("`--decimate` is for splat files. Export one, then make the page of that file.")
     if out.exists() and not flags.force:
         raise UsageError(f"`--out` must not exist yet, got {out}. Add --force to replace it, or choose another name.")
     if not out.parent.is_dir():
@@ -53,6 +59,8 @@ def main(argv: Sequence[str]) -> int:
     source = splats_in(flags.source)
     antialiased = is_antialiased(source)
     gaussians = load_splats(source, strict=flags.strict)
+    if share < 1:
+        gaussians = merged(flags.source, gaussians, share)
     if suffix == PAGE:
         write_page(flags.source, gaussians, out, antialiased)
     else:
@@ -60,6 +68,38 @@ def main(argv: Sequence[str]) -> int:
         note_losses(suffix, gaussians.sh_degree, antialiased)
     print(f"{out}: {len(gaussians):,} splats, {out.stat().st_size:,} bytes")
     return 0
+
+
+def share_of(text: str) -> float:
+    """`25%` as 0.25; UsageError for anything else."""
+    try:
+        share = float(text.removesuffix("%")) / 100 if text.endswith("%") else 0.0
+    except ValueError:
+        share = 0.0
+    if not 0 < share <= 1:
+        raise UsageError(f"`--decimate` must be more than 0% and at most 100%, got {text}. Give a share as 25%.")
+    return share
+
+
+def merged(source: Path, gaussians: Gaussians, share: float) -> Gaussians:
+    """Fewer splats; prints the PSNR of a run's views before and after."""
+    from gsopt.data.refined_poses import with_refined_poses
+    from gsopt.data.scene import load_scene
+    from gsopt.results.clean import input_psnr
+    from gsopt.results.decimate import decimated
+    from gsopt.results.finished_run import open_run
+
+    fewer = decimated(gaussians, share)
+    if (source / "config.json").is_file():
+        run = open_run(source)
+        scene = with_refined_poses(load_scene(run.config.data), run.path)
+        for name, views in (("input", scene.train), ("held-out", scene.test)):
+            if views:
+                before, after = (input_psnr(run, splats, views[:MEASURED_VIEWS]) for splats in (gaussians, fewer))
+                print(
+                    f"{name} views: {before:.2f} dB, with {share:.0%} of the splats {after:.2f} ({after - before:+.2f})"
+                )
+    return fewer
 
 
 def write_page(source: Path, gaussians: Gaussians, out: Path, antialiased: bool) -> None:
