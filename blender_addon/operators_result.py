@@ -15,6 +15,7 @@ from .preferences import absolute, python, work_folder
 
 PAGE = "page.html"
 SPLATS, BEFORE = "splat.ply", "splat.before-clean.ply"
+METRICS_BEFORE = "metrics.before-clean.json"
 
 
 def finished_run(context: Any) -> Path:
@@ -68,6 +69,8 @@ class GSOPT_OT_undo_clean(ReportingOperator, bpy.types.Operator):
         if before.is_symlink() or not before.is_file():
             raise UsageError(f"{run.name} was not cleaned. Nothing was changed.")
         before.replace(run / SPLATS)
+        if (run / METRICS_BEFORE).is_file():
+            (run / METRICS_BEFORE).replace(run / "metrics.json")
         return f"{run.name} is as it was. Import it to see it."
 
 

@@ -20,10 +20,14 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.camera_paths import turntable_path
 from gsopt.geometry.cameras import Cameras
+from gsopt.results.evaluation import evaluate, read_metrics
 from gsopt.results.finished_run import FinishedRun, draw, look_at_point, with_longest_side
+from gsopt.results.report import write_report
 from gsopt.results.video import as_image
 
 SPLATS, BEFORE, PICTURE = "splat.ply", "splat.before-clean.ply", "clean.png"
+METRICS, METRICS_BEFORE = "metrics.json", "metrics.before-clean.json"
+REPORT = "report.html"
 SIDE, GAP, ROWS = 360, 8, 3
 
 
@@ -36,14 +40,32 @@ def replace_splats(run: FinishedRun, keep: Bool[Tensor, "N"]) -> None:
     if not before.exists():
         os.link(splats, before)
     save_splats(splats, run.gaussians.select(keep), antialiased=antialiased)
+    measure_again(run.path)
+
+
+def measure_again(run: Path) -> None:
+    """Write metrics.json and the report of an evaluated run anew; the first are kept as metrics.before-clean.json."""
+    metrics, before = run / METRICS, run / METRICS_BEFORE
+    if not metrics.is_file():
+        return
+    if not before.exists():
+        os.link(metrics, before)
+    mean = read_metrics(run).get("mean")
+    evaluate(run, vgg=isinstance(mean, dict) and mean.get("lpips_vgg") is not None)
+    if (run / REPORT).is_file():
+        write_report(run)
 
 
 def undo(run: Path) -> None:
-    """Bring splat.before-clean.ply back as splat.ply."""
+    """Bring splat.before-clean.ply back as splat.ply, and the figures that belong to it."""
     before = run / BEFORE
     if before.is_symlink() or not before.is_file():
         raise UsageError(f"{run} was not cleaned: there is no {BEFORE}. Nothing was changed.")
     os.replace(before, run / SPLATS)
+    if (run / METRICS_BEFORE).is_file():
+        os.replace(run / METRICS_BEFORE, run / METRICS)
+        if (run / REPORT).is_file():
+            write_report(run)
 
 
 def write_picture(run: FinishedRun, keep: Bool[Tensor, "N"], views: tuple[View, ...]) -> None:

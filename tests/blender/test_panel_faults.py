@@ -287,5 +287,7 @@ def test_a_run_is_shared_and_cleaned_or_the_reason_is_told(panel: Any, tmp_path:
     assert "3 go" in panel.message
     fails_with("was not cleaned", bpy.ops.gsopt.undo_clean)
     (run / "splat.before-clean.ply").write_bytes(b"before")
+    (run / "metrics.before-clean.json").write_text("first")
     bpy.ops.gsopt.undo_clean()
     assert (run / "splat.ply").read_bytes() == b"before"
+    assert (run / "metrics.json").read_text() == "first"

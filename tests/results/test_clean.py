@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from gsopt.formats import load_splats, save_splats
 from gsopt.formats.ply import ply_antialiased
 from gsopt.gaussians import Gaussians
 from gsopt.results import clean
+from gsopt.results.evaluation import evaluate
 from gsopt.results.finished_run import FinishedRun, open_run
 
 GOOD = 12
@@ -125,6 +127,20 @@ def test_a_run_is_cleaned_and_brought_back(tmp_path: Path, capsys: pytest.Captur
     assert main(["clean", str(run), "--undo"]) == 0
     assert (run / "splat.ply").read_bytes() == before
     assert main(["clean", str(run), "--undo"]) == 2
+
+
+def test_the_metrics_of_a_cleaned_run_are_those_of_its_splats(tmp_path: Path) -> None:
+    """A box takes half of the splats away: the figures fall, and are the first again when it is undone."""
+    run = make_run(tmp_path, train=4, test=2)
+    evaluate(run)
+    first = (run / "metrics.json").read_bytes()
+    for _ in range(2):
+        assert main(["clean", str(run), "--box", "0", "-9", "-9", "9", "9", "9"]) == 0
+    cleaned = json.loads((run / "metrics.json").read_text())
+    assert cleaned["mean"]["psnr"] < json.loads(first)["mean"]["psnr"] - 1
+    assert cleaned == evaluate(run) | {"protocol": cleaned["protocol"]}
+    assert main(["clean", str(run), "--undo"]) == 0
+    assert (run / "metrics.json").read_bytes() == first
 
 
 def test_a_file_loses_what_nobody_can_see(tmp_path: Path) -> None:
