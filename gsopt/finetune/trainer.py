@@ -1,12 +1,14 @@
-"""Trains a view-conditioned prior: x0 by least squares, averaged weights, resumable bit for bit."""
+"""Trains a network: AdamW, averaged weights, resumable bit for bit; a view-conditioned prior by least squares."""
 
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,32 +20,34 @@ from gsopt.events import write_atomic
 from gsopt.finetune.batches import Batch, draw_batch
 from gsopt.finetune.caption_tokens import SceneCaptions
 from gsopt.finetune.reconstruction_pairs import Pairs
-from gsopt.finetune.training_config import PriorTrainingConfig
+from gsopt.finetune.training_config import PriorTrainingConfig, TrainingConfig
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.view_conditioned import cosine_schedule, predict
 
 EDGE_WEIGHT = 0.1
 """Weight of the error of the image gradients, against blur."""
 STATE = "training.safetensors"
+Data = TypeVar("Data")
 
 
-class PriorTrainer:
+class AveragedTrainer(Generic[Data]):
     """Network, averaged weights and optimizer of one training."""
 
-    def __init__(self, unet: Any, config: PriorTrainingConfig, captions: SceneCaptions | None = None) -> None:
-        self.unet, self.config, self.captions, self.step = unet.train(), config, captions, 0
+    def __init__(self, unet: Any, config: TrainingConfig) -> None:
+        self.unet, self.config, self.step = unet.train(), config, 0
         self.average = {name: value.detach().clone() for name, value in unet.state_dict().items()}
         self.optimizer = torch.optim.AdamW(
             unet.parameters(), lr=config.lr, weight_decay=config.weight_decay, betas=(0.9, 0.99), fused=True
         )
-        self.noise = cosine_schedule()
 
-    def advance(self, pairs: Pairs) -> float:
+    def loss(self, data: Data) -> Tensor:
+        """The loss of a batch that depends on nothing but the data, the seed and the step."""
+        raise NotImplementedError
+
+    def advance(self, data: Data) -> float:
         """Takes one step and returns its loss. Raises NumericalError when it is not finite; the last saved state is
         valid."""
-        random = generator(self.config.seed, self.step, 0, "lessons")
-        batch = draw_batch(pairs, self.config.batch, self.noise, random, self.captions)
-        found = loss(self.unet, batch)
+        found = self.loss(data)
         if not bool(torch.isfinite(found)):
             raise NumericalError(f"The loss of step {self.step} is {float(found)}. Lower --lr and run again.")
         for group in self.optimizer.param_groups:
@@ -59,12 +63,14 @@ class PriorTrainer:
                 self.average[name].lerp_(value, 1 - decay)
         return float(found.detach())
 
-    def run(self, pairs: Pairs, folder: Path, on_step: Callable[[int, float], None]) -> None:
-        """Trains to the last step and saves regularly; calls `on_step` with every step and its loss."""
-        while self.step < self.config.steps:
-            found = self.advance(pairs)
+    def run(self, data: Data, folder: Path, on_step: Callable[[int, float], None], until: float = math.inf) -> None:
+        """Trains to the last step, or to the time `until` on the monotonic clock, and saves regularly; calls `on_step`
+        with every step and its loss."""
+        while self.step < self.config.steps and time.monotonic() < until:
+            found = self.advance(data)
             on_step(self.step, found)
-            if self.step % self.config.save_every == 0 or self.step == self.config.steps:
+            late = time.monotonic() >= until
+            if self.step % self.config.save_every == 0 or self.step == self.config.steps or late:
                 self.save(folder / STATE)
 
     def save(self, path: Path) -> None:
@@ -83,10 +89,11 @@ class PriorTrainer:
                 meta = json.loads((file.metadata() or {})["gsopt"])
                 # Cloned: in the file they may be unaligned, where matrix products round differently.
                 tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 (not a dict)
-            if meta["course"] != asdict(self.config):
+            if meta["course"] != json.loads(json.dumps(asdict(self.config))):
                 raise ValueError(f"it belongs to a training with {meta['course']}")
             self.unet.load_state_dict(_part(tensors, "unet."))
-            self.average = _part(tensors, "average.")
+            for name, value in _part(tensors, "average.").items():
+                self.average[name].copy_(value)
             records: dict[int, dict[str, Tensor]] = {}
             for name, value in _part(tensors, "optimizer.").items():
                 index, key = name.split(".", 1)
@@ -110,6 +117,18 @@ class PriorTrainer:
         """Loads the trained weights again after `use_average`."""
         self.unet.load_state_dict(self._trained_weights)
         self.unet.train()
+
+
+class PriorTrainer(AveragedTrainer[Pairs]):
+    """Training of a view-conditioned prior."""
+
+    def __init__(self, unet: Any, config: PriorTrainingConfig, captions: SceneCaptions | None = None) -> None:
+        super().__init__(unet, config)
+        self.captions, self.noise = captions, cosine_schedule()
+
+    def loss(self, data: Pairs) -> Tensor:
+        random = generator(self.config.seed, self.step, 0, "lessons")
+        return loss(self.unet, draw_batch(data, self.config.batch, self.noise, random, self.captions))
 
 
 def loss(unet: Any, batch: Batch) -> Tensor:

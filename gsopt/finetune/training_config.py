@@ -9,8 +9,8 @@ from gsopt import check
 
 
 @dataclass(frozen=True)
-class PriorTrainingConfig:
-    """Settings of a prior's training."""
+class TrainingConfig:
+    """Settings of the training of any network."""
 
     steps: int = 6000
     batch: int = 16
@@ -21,13 +21,10 @@ class PriorTrainingConfig:
     """Decay of the averaged weights, which the prior keeps; lower at first."""
     save_every: int = 200
     seed: int = 0
-    clip_steps: int = 1000
-    """Training steps of the CLIP for the scenes' captions, when they have captions and --base has no CLIP."""
 
     def __post_init__(self) -> None:
         check.at_least("--steps", self.steps, 1, "A few thousand are a start.")
         check.at_least("--batch", self.batch, 1, "16 is usual.")
-        check.at_least("--clip-steps", self.clip_steps, 0, "0 trains none: the prior takes no text.")
         check.within("--lr", self.lr, 0.0, 1.0, "The default is 4e-4.")
 
     def rate(self, step: int) -> float:
@@ -35,3 +32,15 @@ class PriorTrainingConfig:
         warm = max(1, self.steps // 50)
         progress = min(1.0, max(0.0, (step - warm) / max(1, self.steps - warm)))
         return self.lr * min(1.0, (step + 1) / warm) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
+
+
+@dataclass(frozen=True)
+class PriorTrainingConfig(TrainingConfig):
+    """Settings of a view-conditioned prior's training."""
+
+    clip_steps: int = 1000
+    """Training steps of the CLIP for the scenes' captions, when they have captions and --base has no CLIP."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check.at_least("--clip-steps", self.clip_steps, 0, "0 trains none: the prior takes no text.")

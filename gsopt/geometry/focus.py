@@ -83,7 +83,7 @@ def nearest_to_axes(centers: Float[Tensor, "C 3"], axes: Float[Tensor, "C 3"], d
 
 def across_axes(axes: Float[Tensor, "C 3"]) -> Float[Tensor, "C 3 3"]:
     """I - a aᵀ: removes what lies along each axis."""
-    return torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
+    return torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None, :]
 
 
 def up_direction(
