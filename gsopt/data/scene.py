@@ -93,9 +93,11 @@ class Scene:
     mirrored: tuple[View, ...] = ()
     """Images of the input views behind mirrors or turned about an axis, where the object is symmetric."""
     guessed: tuple[View, ...] = ()
-    """Views of the shape that a single photo suggests (gsopt/init/inflation.py)."""
+    """Views of the shape that a single photo, or up to three with a shape prior, suggest (gsopt/init/inflation.py)."""
     body: Grid | None = None
-    """This shape, where something else than inflation found it (gsopt/shape_library)."""
+    """This shape, where something else than inflation found it (gsopt/shape_library, gsopt/shape_prior)."""
+    body_colors: Float[Tensor, "X Y Z 3"] | None = None
+    """Colors of its voxels (0..1) for the sides that no photo shows; without them the photo's go straight through."""
 
     @property
     def observed(self) -> tuple[View, ...]:
@@ -109,8 +111,8 @@ class Scene:
 
     @property
     def completed(self) -> bool:
-        """True when a single photo is completed by images that nobody took."""
-        return len(self.train) == 1 and len(self.drawn) > 1
+        """True when the photos are completed by images that nobody took: one by any, several by guesses."""
+        return len(self.guessed) > 0 or (len(self.train) == 1 and len(self.drawn) > 1)
 
     @property
     def extent(self) -> float:

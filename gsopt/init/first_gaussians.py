@@ -84,7 +84,8 @@ def _from_hull(scene: Scene, count: int, sh_degree: int, generator: torch.Genera
     if found is None:
         return None
     gaussians = gaussians_at(found.xyz, found.rgb, sh_degree)
-    guess = "inflated silhouette" if scene.body is None else "shapes of a library"
+    body = "shapes of a library" if scene.body_colors is None else "body of a shape prior"
+    guess = "inflated silhouette" if scene.body is None else body
     shape = guess if scene.guessed else f"visual hull of {found.silhouettes} silhouettes"
     return (
         gaussians,

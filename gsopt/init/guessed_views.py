@@ -1,8 +1,9 @@
-"""Views of the shape that one photo suggests, from where nobody photographed it: the rest of the object, as a guess."""
+"""Views of the shape that the photos suggest, from where nobody photographed it: the rest of the object, as a guess."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,7 +17,7 @@ from gsopt.geometry.focus import world_up
 from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.geometry.voxels import Grid
 from gsopt.init.inflation import inflated, object_box
-from gsopt.init.surface_colors import unoccluded_colors
+from gsopt.init.surface_colors import seen_colors, unoccluded_colors
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.backend import Backend, RasterSettings
 
@@ -43,22 +44,27 @@ class DrawnImages:
 
 
 def with_guessed_views(scene: Scene, backend: Backend) -> Scene:
-    """The scene with guessed views where it has one input view, with alpha; any other scene as it is."""
-    if len(scene.train) != 1 or not scene.has_alpha:
+    """The scene with guessed views where it has one input view, with alpha, or a body; any other scene as it is."""
+    if (len(scene.train) != 1 and scene.body is None) or not scene.has_alpha:
         return scene
-    photo = small_photos(scene.train, 1)[0]
-    grid = scene.body or inflated(photo, scene.extent)
+    photos = small_photos(scene.train, len(scene.train))
+    grid = scene.body or inflated(photos[0], scene.extent)
     if grid is None:
         return scene
-    cameras = surrounding_cameras(photo, scene.extent)
-    store = DrawnImages(drawn_voxels(grid, photo, cameras, backend))
+    middle = object_middle(photos[0], scene.extent) if len(photos) == 1 else grid.centers().mean(0)
+    cameras = surrounding_cameras(photos[0], middle)
+    store = DrawnImages(drawn_voxels(grid, photos, cameras, backend, scene.body_colors))
     views = [View(f"guess_{i:02d}", cameras[i], store, i, color=COLOR_WEIGHT) for i in range(COUNT)]
     return replace(scene, guessed=tuple(views))
 
 
-def surrounding_cameras(photo: Thumbnail, extent: float) -> Cameras:
+def object_middle(photo: Thumbnail, extent: float) -> Float[Tensor, "3"]:
+    """The middle of the object in a single photo."""
+    return object_box(photo.camera, photo.alpha()[0] > 0.5, extent)[0]
+
+
+def surrounding_cameras(photo: Thumbnail, middle: Float[Tensor, "3"]) -> Cameras:
     """Cameras on a spiral around the object (Fibonacci), at the photo's distance, with its lens and size."""
-    middle, _, _ = object_box(photo.camera, photo.alpha()[0] > 0.5, extent)
     distance = float((photo.camera.centers[0] - middle).norm())
     number = torch.arange(COUNT) + 0.5
     height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * number / COUNT
@@ -72,10 +78,20 @@ def surrounding_cameras(photo: Thumbnail, extent: float) -> Cameras:
     return replace(photo.camera, viewmats=viewmats, Ks=photo.camera.Ks.repeat(COUNT, 1, 1))
 
 
-def drawn_voxels(grid: Grid, photo: Thumbnail, cameras: Cameras, backend: Backend) -> UInt8[Tensor, "C H W 4"]:
-    """The shape in the photo's colors, which go straight through it: straight sRGB color and alpha."""
+def drawn_voxels(
+    grid: Grid,
+    photos: Sequence[Thumbnail],
+    cameras: Cameras,
+    backend: Backend,
+    unseen: Float[Tensor, "X Y Z 3"] | None = None,
+) -> UInt8[Tensor, "C H W 4"]:
+    """The shape in the photos' colors, which go straight through it, or in colors of its own where no photo shows it:
+    straight sRGB color and alpha."""
     points = grid.surface()
-    colors = unoccluded_colors(grid, [photo], points)
+    colors = unoccluded_colors(grid, photos, points)
+    if unseen is not None:
+        own = unseen[tuple(((points - grid.low) / grid.voxel).long().T)]
+        colors = torch.where(seen_colors(grid, photos, points)[1][:, None], colors, own)
     gaussians = voxel_gaussians(points, colors, SPLAT_SCALE * grid.voxel).to(backend.device)
     settings, black = RasterSettings(sh_degree=0), torch.zeros(3)
     images = []

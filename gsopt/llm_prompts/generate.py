@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsopt import check
 from gsopt._optional import require
-from gsopt.config.guidance import GuidanceConfig, library_of
+from gsopt.config.guidance import GuidanceConfig, completes_bodies
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, write_atomic
 from gsopt.llm_prompts.deduplicate import without_duplicates
@@ -87,7 +87,7 @@ def make_prompts(job: PromptJob, report: Report) -> PromptResult:
     fallback to the template is allowed.
     """
     template = load_template(job.domain)
-    if library_of(job.prior) is not None:
+    if completes_bodies(job.prior):
         template = for_library(template)
     spec = PromptSpec(job.notes.strip(), job.category.strip() or find_object(job.notes), job.n, job.negatives)
     folder = prior_folder(job.prior)
@@ -114,7 +114,7 @@ def prior_folder(prior: str) -> Path | None:
     """
     from gsopt.sds.select_prior import EMBEDDED, embedded_prior_obstacle
 
-    if library_of(prior) is not None:
+    if completes_bodies(prior):
         return None
     if prior in ("auto", "embedded"):
         return EMBEDDED if embedded_prior_obstacle() is None else None

@@ -6,7 +6,7 @@ import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsopt.config.guidance import GuidanceConfig, library_of
+from gsopt.config.guidance import GuidanceConfig, completes_bodies, shape_prior_of
 from gsopt.errors import UsageError
 
 DEFAULT_WEIGHT = 0.2
@@ -16,6 +16,7 @@ NOT_ASKED = f"nobody asked for a prior (`--lambda_sds {DEFAULT_WEIGHT}`, `--prio
 """The one that ships never gained more than chance where nobody asked (docs/decisions/0010-prior-on-request.md)."""
 NO_WEIGHTS = "this copy of gsopt carries no prior; name one with --prior sd21, a folder or a hub id"
 LIBRARY = "a shape library completes the first shape and guides no step"
+SHAPE = "a shape prior completes the first shape and guides no step"
 NO_DIFFUSERS = "the embedded prior needs diffusers: pip install 'gsopt[sds]'"
 
 
@@ -34,8 +35,8 @@ def select_prior(config: GuidanceConfig) -> PriorSelection:
     """Selects prior and weight of a new run. Raises UsageError when guidance is requested and no prior is available."""
     if config.lambda_sds == 0:
         return PriorSelection(None, 0.0, "lambda_sds is 0")
-    if library_of(config.prior) is not None:
-        return PriorSelection(None, 0.0, LIBRARY)
+    if completes_bodies(config.prior):
+        return PriorSelection(None, 0.0, LIBRARY if shape_prior_of(config.prior) is None else SHAPE)
     requests = guidance_flags(config)
     if not requests:
         return PriorSelection(None, 0.0, NOT_ASKED)

@@ -27,6 +27,10 @@ GUESSED = (
     "colors. A second photo from the side helps most."
 )
 LIKENED = GUESSED.replace("the silhouette inflated to a body", "shapes of a library, mixed,")
+COMPLETED = (
+    "A few photos show a few sides: shape and color of the others are a guess of a shape prior. Another photo from "
+    "there helps most."
+)
 TURNED = (
     "One photo shows one side: the other sides are a guess. The silhouette is that of a thing which looks the same "
     "from all around an upright axis, and that is assumed. A second photo from the side tells."
@@ -43,7 +47,7 @@ def few_photo_warnings(scene: Scene) -> tuple[str, ...]:
     faults = [fault for view, photo in zip(scene.train, photos, strict=True) for fault in _mask_faults(view, photo)]
     faults += _direction_faults(scene)
     if scene.completed:
-        guess = GUESSED if scene.body is None else LIKENED
+        guess = GUESSED if scene.body is None else LIKENED if scene.body_colors is None else COMPLETED
         faults.append(guess if scene.guessed else TURNED)
     return tuple(faults)
 

@@ -35,6 +35,7 @@ from gsopt.training.library_body import with_library_body
 from gsopt.training.mirror_images import with_recorded_mirrors
 from gsopt.training.plan import RunPlan, guesses
 from gsopt.training.run_directory import Listener, RunDirectory, opened
+from gsopt.training.shape_prior_body import with_shape_prior_body
 from gsopt.training.trainer import Trainer
 
 PROGRESS_SECONDS = 0.5
@@ -85,6 +86,7 @@ def train(
             require_readable(scene.test)
             scene = with_recorded_mirrors(config, scene, directory)
             scene = with_library_body(config, scene, backend, directory)
+            scene = with_shape_prior_body(config, scene, backend, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)
             plan = RunPlan.of(config, scene)

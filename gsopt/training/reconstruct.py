@@ -9,7 +9,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from gsopt.config.guidance import library_of
+from gsopt.config.guidance import library_of, shape_prior_of
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.data.sfm.reuse import needs_poses, posed_scene
 from gsopt.data.sfm.settings import SfmConfig
@@ -24,6 +24,7 @@ from gsopt.training.interrupt import Stopped, StopRequest
 from gsopt.training.library_body import require_library
 from gsopt.training.loop import PROGRESS_SECONDS, TrainResult, train
 from gsopt.training.run_directory import Listener, RunDirectory, opened, refuse_another_run
+from gsopt.training.shape_prior_body import require_shape_prior
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ def reconstruct(
         refuse_another_run(run)
         require_guidance(config.guidance)
         require_library(config.guidance)
+        require_shape_prior(config.guidance)
     networks(vgg)
     read_metrics(run)
     config = _with_masks(_with_poses(config, run, log), run, log)
@@ -117,9 +119,11 @@ def _absolute_masks(choice: str) -> str:
 
 
 def _absolute(name: str) -> str:
-    """The absolute path of something that exists, any other name as it is; `library:PATH` keeps its kind."""
-    if named := library_of(name):
-        return f"library:{_absolute(named)}"
+    """The absolute path of something that exists, any other name as it is; `library:PATH` and `shape:DIR` keep their
+    kind."""
+    for kind, named in (("library", library_of(name)), ("shape", shape_prior_of(name))):
+        if named:
+            return f"{kind}:{_absolute(named)}"
     path = Path(name).expanduser()
     return str(path.absolute()) if name and path.exists() else name
 

@@ -22,6 +22,7 @@ from gsopt.results.report.cameras_section import cameras_section
 from gsopt.results.report.embedded_images import shrunk
 from gsopt.results.report.guidance_section import guidance_section
 from gsopt.results.report.library_section import library_section
+from gsopt.results.report.shape_prior_section import shape_prior_section
 from gsopt.results.report.values import number, text
 from gsopt.results.video import as_image
 from gsopt.results.web.page import viewer_element
@@ -110,7 +111,7 @@ def read_run(run: Path, config: TrainConfig) -> Report:
     )
     messages += [message for event in events if (message := _message(event)) is not None]
     report.guidance = guidance_section(run, messages)
-    report.library = library_section(run, messages)
+    report.library = library_section(run, messages) + shape_prior_section(run, messages)
     report.cameras = cameras_section(Path(config.data.path), run, messages)
     _add_figures(report)
     try:

@@ -1,0 +1,1 @@
+"""Trains a 3D diffusion prior on the shapes of a library."""
