@@ -125,7 +125,7 @@ class GsoptScene(bpy.types.PropertyGroup):
     views: IntProperty(name="Input Views", default=0, min=0, description="Learn from this many; 0: all")  # type: ignore[valid-type]
     hold_out: BoolProperty(name="Hold out Every 8th", default=False)  # type: ignore[valid-type]
     strategy: EnumProperty(name="Density", items=[("adc", "ADC", ""), ("mcmc", "MCMC", "")])  # type: ignore[valid-type]
-    background: EnumProperty(name="Background", items=items("white", "black", "random"))  # type: ignore[valid-type]
+    background: EnumProperty(name="Background", items=items("auto", "white", "black", "random"))  # type: ignore[valid-type]
     device: EnumProperty(name="Prior on", items=[("auto", "Auto", ""), ("cpu", "CPU", ""), ("cuda", "GPU", "")])  # type: ignore[valid-type]
     threads: IntProperty(name="Threads", default=0, min=0, description="0: one per core")  # type: ignore[valid-type]
     seed: IntProperty(name="Seed", default=0, min=0)  # type: ignore[valid-type]

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt import check
@@ -37,6 +37,10 @@ VGG_NOTE = (
 )
 MAX_WEIGHT_BYTES = 200 * 2**20
 """Largest unpacked size of a file of weights."""
+CC_ROUNDS, CC_CLIPPED = 5, 0.5 / 255
+"""Rounds of the color correction, and the margin below which a channel counts as clipped (Mildenhall et al. 2022)."""
+CC_RIDGE = 1e-6
+"""Weight of no correction, per pixel: decides where the pixels determine none."""
 PSNR_CAP = 100.0
 """dB; replaces the infinite PSNR of two equal images, which JSON cannot hold."""
 
@@ -65,6 +69,32 @@ def object_psnr(
     squared = (rendered.double() - truth.double()).square().mean(dim=3)
     mse = (squared * alphas).sum(dim=(1, 2)) / alphas.double().sum(dim=(1, 2))
     return (20 * torch.log10(1 / mse.sqrt())).clamp(max=PSNR_CAP)
+
+
+def color_corrected(
+    rendered: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], alphas: Float[Tensor, "H W"] | None = None
+) -> Float[Tensor, "H W 3"]:
+    """The render after the affine map of RGB, one for the whole image, that brings it nearest to the truth.
+
+    A photo's exposure and white balance are not known before it is taken, so the field also reports PSNR after a fit
+    per image, `cc_psnr` (Mildenhall et al. 2022, RawNeRF; Wang et al. 2024, bilateral guided radiance fields). As
+    there, least squares over pixels that are clipped in neither image, again after each correction. `alphas` weigh
+    the pixels, and what they leave transparent keeps its color."""
+    truths, corrected = truth.double().view(-1, 3), rendered.double().view(-1, 3)
+    sources = torch.cat([corrected, torch.ones_like(corrected[:, :1])], dim=1)
+    identity = torch.eye(4, 3, dtype=torch.float64, device=sources.device)
+    weights = torch.ones_like(corrected[:, 0]) if alphas is None else alphas.double().flatten()
+    shown = (_unclipped(truths) & _unclipped(sources[:, :3])) * weights
+    ridge = CC_RIDGE * len(sources) * torch.eye(4, dtype=torch.float64, device=sources.device)
+    for _ in range(CC_ROUNDS):
+        weighted = (shown * _unclipped(corrected))[:, None] * sources
+        warp = torch.linalg.solve(weighted.T @ sources + ridge, weighted.T @ truths + ridge @ identity)
+        corrected = (sources @ warp).clamp(0, 1)
+    return (rendered + weights.view(*truth.shape[:2], 1) * (corrected.view(truth.shape) - rendered)).to(truth)
+
+
+def _unclipped(colors: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+    return ((colors >= CC_CLIPPED) & (colors <= 1 - CC_CLIPPED)).all(dim=1)
 
 
 def ssim(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsopt import metrics
 from gsopt.errors import InputError, UsageError
-from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, object_psnr, psnr, ssim
+from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, color_corrected, object_psnr, psnr, ssim
 
 LPIPS_TOLERANCE = 5e-5
 """Weights rounded to float16 move the distance by at most 3e-5 (measured against float32)."""
@@ -209,3 +209,32 @@ def test_object_psnr_counts_pixels_by_their_alpha() -> None:
     assert torch.equal(object_psnr(noisy, truth, alphas), inside)
     halved = object_psnr(rendered, truth, alphas / 2)
     torch.testing.assert_close(halved, inside)
+
+
+def test_color_correction_undoes_an_affine_change_of_color() -> None:
+    """Exposure, white balance and mixed channels; pixels that the change clips are left out of the fit."""
+    truth = waves(24, 30, 0.3)[0]
+    mixed = torch.tensor([[0.7, 0.05, 0.0], [0.02, 0.8, 0.03], [0.0, 0.1, 0.6]])
+    changed = truth @ mixed + torch.tensor([0.02, 0.05, 0.1])
+    torch.testing.assert_close(color_corrected(changed, truth), truth, atol=1e-3, rtol=0)
+    brighter = (1.3 * truth).clamp(max=1)
+    kept = brighter.amax(dim=2) < 1
+    torch.testing.assert_close(color_corrected(brighter, truth)[kept], truth[kept], atol=2e-3, rtol=0)
+
+
+def test_color_correction_changes_no_color_where_nothing_determines_it() -> None:
+    """Images that are clipped everywhere, and masks that are empty."""
+    white, other = torch.ones(6, 6, 3), waves(6, 6, 0.1)[0]
+    assert torch.equal(color_corrected(white, other), white)
+    torch.testing.assert_close(color_corrected(other, white[..., :3] * 0.5, torch.zeros(6, 6)), other)
+
+
+def test_color_correction_is_fitted_inside_the_mask() -> None:
+    truth = waves(16, 16, 0.2)[0]
+    changed = 0.8 * truth + 0.1
+    changed[:, 8:] = noise(16, 8, 3)
+    alphas = torch.zeros(16, 16)
+    alphas[:, :8] = 1
+    corrected = color_corrected(changed, truth, alphas)
+    torch.testing.assert_close(corrected[:, :8], truth[:, :8], atol=1e-3, rtol=0)
+    assert torch.equal(corrected[:, 8:], changed[:, 8:]), "a background has no exposure"

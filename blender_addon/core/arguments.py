@@ -23,7 +23,7 @@ class Training:
     """Learn from this many, well spread; 0: all."""
     hold_out: bool = False
     strategy: str = "adc"
-    background: str = "white"
+    background: str = "auto"
     seed: int = 0
     threads: int = 0
     backend: str = "auto"

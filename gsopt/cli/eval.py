@@ -63,8 +63,9 @@ def summary(metrics: dict[str, Any]) -> str:
 def _figures(mean: dict[str, float | None]) -> str:
     columns = {"psnr": ("PSNR", ".2f", " dB"), "ssim": ("SSIM", ".4f", "")}
     columns |= {"lpips_alex": ("LPIPS (Alex)", ".4f", ""), "lpips_vgg": ("LPIPS (VGG)", ".4f", "")}
-    if mean.get("psnr_object") is not None:
-        columns["psnr_object"] = ("PSNR inside the masks", ".2f", " dB")
+    further = {"cc_psnr": "PSNR color-corrected", "psnr_object": "PSNR inside the masks"}
+    further["cc_psnr_object"] = "the same color-corrected"
+    columns |= {key: (title, ".2f", " dB") for key, title in further.items() if mean.get(key) is not None}
     parts = []
     for key, (title, digits, unit) in columns.items():
         if key in mean:

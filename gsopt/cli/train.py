@@ -80,9 +80,11 @@ def one_data_folder(flags: Flags) -> Path | None:
 def make_config(flags: Flags, data: Path) -> TrainConfig:
     """All settings of a new run."""
     background = flags.settings.data.background
-    if flags.white_background and background != "white":
+    if flags.white_background and background not in ("auto", "white"):
         raise UsageError(f"`-w` and `--background {background}` contradict each other. Keep one of them.")
-    return replace(flags.settings, data=replace(flags.settings.data, path=str(data.expanduser().absolute())))
+    chosen = "white" if flags.white_background else background
+    path = str(data.expanduser().absolute())
+    return replace(flags.settings, data=replace(flags.settings.data, path=path, background=chosen))
 
 
 def recorded_config(flags: Flags, run: Path) -> TrainConfig:

@@ -32,6 +32,8 @@ FLAGS = {
     "iterations": "--iterations N",
     "data.masks": "--masks given|auto|none|DIR",
     "data.mask_model": "--mask-model FILE",
+    "data.depth": "--depth DIR",
+    "data.depth_kind": "--depth-kind",
     "data.views": "--views N",
     "data.view_ids": "--view-ids I,J,...",
     "data.downscale": "--resolution -r",
@@ -49,6 +51,7 @@ FLAGS = {
     "guidance.prompts": "--prompts FILE",
     "guidance.ref_image": "--ref-image FILE",
     "poses.refine": "--refine-poses",
+    "exposure.learn": "--exposure",
 }
 """Flag, short form and metavar of a setting; every other one is its own flag: --optimizer.lr-last."""
 POSITIONAL = "data.path"
@@ -71,7 +74,7 @@ class Flags:
     vgg: bool = False
     """Also compute LPIPS (VGG) on the held-out views, at many times the cost of the rest; needs its weights."""
     white_background: Annotated[bool, arg(aliases=["-w"])] = False
-    """The same as --background white, which is the default."""
+    """The same as --background white."""
     settings: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
 

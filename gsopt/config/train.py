@@ -43,20 +43,22 @@ class DataConfig:
     """Divisor of width and height (area filter)."""
     eval: bool = False
     """Hold out every 8th image when the dataset has no test split of its own."""
-    background: Literal["white", "black", "random"] = "white"
-    """Color behind transparent pixels. random draws one per step and evaluates on white."""
+    background: Literal["auto", "white", "black", "random"] = "auto"
+    """Color behind transparent pixels and behind what no photo shows. auto: white with masks or alpha, else the mean
+    color of the photos; random draws one per step and evaluates on white."""
     cache_mb: Count = 2048
     """Decoded images kept in memory, MB; the rest is read again when needed."""
     masks: str = "given"
     """Masks of the object: given (alpha or the dataset's own folder), none (no mask files), a folder with a mask named
     like each image, or auto: given ones, else made by a mask model (see gsopt masks)."""
+    depth: str | None = None
+    """Folder with a depth map named like each input image, .npy or 16-bit .png, of any scale and, where inverse, shift:
+    from a sensor or a network. 0 is unknown."""
+    depth_kind: Literal["distance", "inverse"] = "distance"
+    """Content of the depth maps: distances along the viewing axis, or their inverse (disparity), as most networks give.
+    """
     mask_model: str | None = None
     """ONNX file of the mask model for auto; by default $GSOPT_MASK_MODEL, else one that rembg has fetched."""
-
-    @property
-    def evaluation_background(self) -> tuple[float, float, float]:
-        """Background of renders that are evaluated or displayed: white where training drew random ones."""
-        return BACKGROUNDS.get(self.background, BACKGROUNDS["white"])
 
     def __post_init__(self) -> None:
         check.fields(self, "data")
@@ -125,6 +127,8 @@ class LossConfig:
     """Weight of 1 - SSIM against L1."""
     lambda_alpha: Weight = 0.0
     """Weight of the L1 between rendered alpha and the image's alpha or mask."""
+    lambda_depth: Weight = 0.1
+    """Weight of 1 - the correlation of rendered inverse depths with those of `--depth`, where there are some."""
     lambda_opacity: Weight | None = None
     """Weight of the mean opacity (Kheradmand et al. 2024); by default 0.01 with mcmc, 0 with adc."""
     lambda_scale: Weight | None = None
@@ -246,6 +250,24 @@ class PoseConfig:
 
 
 @dataclass(frozen=True)
+class ExposureConfig:
+    """Correction of the input photos' exposure and white balance during training."""
+
+    learn: bool = False
+    """Learn a factor per input photo and color channel, of mean 1 over the photos (geometric); held-out views have
+    none, see cc_psnr."""
+    lr: Annotated[float, Within(1e-9, 1)] = 5e-3
+    """Largest change of a factor by one step, relative, at first."""
+    lr_final: Annotated[float, Within(1e-9, 1)] = 5e-4
+    """The same at the last step; log-linear in between."""
+    start: Count = 500
+    """Steps before the first change: there must be something to compare with."""
+
+    def __post_init__(self) -> None:
+        check.fields(self, "exposure")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """One run, complete: with the data and the same version of gsopt it gives the same bits again."""
 
@@ -258,6 +280,7 @@ class TrainConfig:
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     poses: PoseConfig = field(default_factory=PoseConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
     preset: Preset = "default"
     """draft: 2000 steps with more skips; default: 7000 steps; high: 15,000 steps. Other settings win over it."""
     iterations: PositiveCount = 7000

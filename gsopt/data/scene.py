@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -14,11 +14,12 @@ from torch import Tensor
 from gsopt.config.train import DataConfig
 from gsopt.data import files
 from gsopt.data.colmap import find_model, read_colmap
+from gsopt.data.depth_maps import DepthFolder
 from gsopt.data.idr import CAMERAS, read_idr
 from gsopt.data.images import ImageSource, ImageStore, check_mask_size, read_header, size_mismatch
 from gsopt.data.llff import POSES, read_llff
 from gsopt.data.masks import with_masks
-from gsopt.data.posed_images import Dataset, PosedImage
+from gsopt.data.posed_images import Dataset, PosedImage, summarize_names
 from gsopt.data.resample import downscaled_size
 from gsopt.data.split import split
 from gsopt.data.transforms import read_transforms
@@ -57,11 +58,20 @@ class View:
     """Read from right to left: not a photo but the mirror image of one (gsopt/symmetry)."""
     color: float = 1.0
     """Weight of its colors in the loss; at 0 only its silhouette counts."""
+    depth: Float[Tensor, "h w"] | None = None
+    """Inverse depths of any scale and shift, NaN where unknown, at their own resolution; see `--depth`."""
 
     def pixels(self) -> UInt8[Tensor, "H W C"]:
         """sRGB-coded pixels, undistorted and downscaled; C = 4 (straight alpha) with alpha or a mask, else 3."""
         stored = self.store.get(self.index)
         return stored.flip(1) if self.mirrored else stored
+
+    def inverse_depths(self, height: int, width: int) -> Float[Tensor, "H W"] | None:
+        """Returns the depth map at a size, by the nearest sample, or None without one."""
+        if self.depth is None:
+            return None
+        sized = torch.nn.functional.interpolate(self.depth[None, None], (height, width), mode="nearest-exact")[0, 0]
+        return sized.flip(1) if self.mirrored else sized
 
 
 @dataclass(frozen=True)
@@ -146,7 +156,8 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
         raise InputError(f"{root} has no input view left after the test views were held out. Add images.")
     warnings = list(dataset.warnings)
     origin = _origin(dataset.frames + (dataset.held_out or []), warnings)  # the same whichever views are chosen
-    views, has_alpha = _views(root, train + test, origin, config)
+    depths = _depth_files(train, config, warnings)  # held-out views need none
+    views, has_alpha = _views(root, train + test, depths, origin, config)
     return Scene(
         path=root,
         kind=dataset.kind,
@@ -207,18 +218,37 @@ def _origin(frames: list[PosedImage], warnings: list[str]) -> Float[Tensor, "3"]
     return origin
 
 
+def _depth_files(train: list[PosedImage], config: DataConfig, warnings: list[str]) -> list[Path | None]:
+    """The depth map of each input view; a warning for those without."""
+    if config.depth is None:
+        return []
+    found = DepthFolder(Path(config.depth).expanduser(), config.depth_kind == "inverse").find([f.name for f in train])
+    if lacking := [frame.name for frame, path in zip(train, found, strict=True) if path is None]:
+        warnings.append(
+            f"{config.depth} has no depth map for {len(lacking)} of {len(train)} input images: "
+            f"{summarize_names(lacking)}."
+        )
+    return found
+
+
 def _views(
-    root: Path, frames: list[PosedImage], origin: Tensor, config: DataConfig
+    root: Path, frames: list[PosedImage], depths: list[Path | None], origin: Tensor, config: DataConfig
 ) -> tuple[tuple[View, ...], list[bool]]:
-    """Views that share one store, and per view True when it has alpha."""
+    """Views that share one store, and per view True when it has alpha. `depths`: those of the first frames."""
     pinholes: dict[tuple[object, ...], Undistortion] = {}
     prepared = [_prepare(root, frame, config.downscale, pinholes) for frame in frames]
     store = ImageStore([image for image, _, _ in prepared], config.cache_mb)
-    views = tuple(
+    views = [
         View(frame.name, _camera(frame, K, origin, image), store, index)
         for index, (frame, (image, K, _)) in enumerate(zip(frames, prepared, strict=True))
-    )
-    return views, [alpha for _, _, alpha in prepared]
+    ]
+    folder = DepthFolder(Path(config.depth or ""), config.depth_kind == "inverse")
+    for index, path in enumerate(depths):
+        if path is not None:
+            image = prepared[index][0]
+            depth = folder.read(path, image.stored, image.undistortion, (image.width, image.height))
+            views[index] = replace(views[index], depth=depth)
+    return tuple(views), [alpha for _, _, alpha in prepared]
 
 
 def _prepare(

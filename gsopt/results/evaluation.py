@@ -19,7 +19,7 @@ from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError
 from gsopt.events import LARGEST_METRICS, refuse_links, to_json, write_atomic
 from gsopt.gaussians import Gaussians
-from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, object_psnr
+from gsopt.metrics import PSNR_CAP, Lpips, capped_psnr, color_corrected, object_psnr
 from gsopt.raster.backend import Backend, RasterSettings
 from gsopt.raster.threads import available_cores, one_torch_thread
 from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
@@ -27,8 +27,8 @@ from gsopt.results.video import safe_name, save_stills
 
 MAX_TRAIN_VIEWS = 16
 """Input views to evaluate, evenly spread, when none is held out."""
-METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "psnr_object")
-"""Metrics of a view; the last only where it has alpha."""
+METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "cc_psnr", "psnr_object", "cc_psnr_object")
+"""Metrics of a view; those of the object only where it has alpha."""
 METRIC_DIGITS = 6
 """Decimals of a metric; further ones depend on the version of torch."""
 MAX_WORKERS = 8
@@ -107,7 +107,7 @@ def _compared(
 ) -> dict[str, Any]:
     """The row of one view, whose render is saved as `path` with the suffix .png."""
     row: dict[str, Any] = {"name": view.name, **_image_metrics(render, seen, similarity, nets)}
-    row |= _object_metrics(render, seen, view)
+    row |= _further_metrics(render, seen, view)
     if path is not None:
         (saved,) = save_stills(path.parent, [(path.name, render)], overwrite=True)
         row["render"] = saved.name
@@ -124,16 +124,21 @@ def _image_metrics(
     return {name: None if value is None else round(value, METRIC_DIGITS) for name, value in values.items()}
 
 
-def _object_metrics(
+def _further_metrics(
     render: UInt8[Tensor, "H W 3"], target: UInt8[Tensor, "H W 3"], view: View
 ) -> dict[str, float | None]:
-    """`psnr_object`: PSNR inside the mask; {} for a view without alpha, None where the alpha is empty."""
+    """PSNR after color correction, and both inside the mask; the latter absent for a view without alpha, None where
+    the alpha is empty."""
     pixels = view.pixels()
-    if pixels.shape[2] == 3:
-        return {}
-    a, b, alphas = (image[None].float() / 255 for image in (render, target, pixels[..., 3]))
-    value = object_psnr(a, b, alphas).item() if bool(alphas.any()) else None
-    return {"psnr_object": None if value is None else round(value, METRIC_DIGITS)}
+    a, b = (image[None].float() / 255 for image in (render, target))
+    alphas = pixels[None, ..., 3].float() / 255 if pixels.shape[2] == 4 else None
+    corrected = color_corrected(a[0], b[0], None if alphas is None else alphas[0])[None]
+    values: dict[str, float | None] = {"cc_psnr": capped_psnr(corrected, b).item()}
+    if alphas is not None:
+        shown = bool(alphas.any())
+        values["psnr_object"] = object_psnr(a, b, alphas).item() if shown else None
+        values["cc_psnr_object"] = object_psnr(corrected, b, alphas).item() if shown else None
+    return {name: None if value is None else round(value, METRIC_DIGITS) for name, value in values.items()}
 
 
 def _mean(per_view: list[dict[str, Any]]) -> dict[str, float | None] | None:
@@ -237,12 +242,14 @@ def _protocol(finished: FinishedRun, scene: Scene, results: dict[str, Any]) -> s
     lpips = "LPIPS v0.1 Alex" + (
         " and VGG (the Inria code feeds VGG [0,1] unscaled, which gives other values)" if "lpips_vgg" in asked else ""
     )
-    background = {"random": "white (trained on random)"}.get(finished.config.data.background)
+    named = finished.config.data.background
+    color = "(" + ", ".join(f"{value:g}" for value in finished.background.tolist()) + ")"
+    background = {"random": "white (trained on random)", "auto": color}.get(named, named)
     return (
-        "PSNR per image then mean; psnr_object inside the truth's alpha; SSIM 11x11 sigma 1.5 zero padding; "
-        f"{lpips}, inputs mapped to [-1,1]; renders and truths rounded to 8 bit as "
+        "PSNR per image then mean; psnr_object inside the truth's alpha; cc_psnr after an affine fit of RGB per image; "
+        f"SSIM 11x11 sigma 1.5 zero padding; {lpips}, inputs mapped to [-1,1]; renders and truths rounded to 8 bit as "
         f"the field does; equal images count as {PSNR_CAP:g} dB; background "
-        f"{background or finished.config.data.background}; split: trained on {len(scene.train)} views, held out "
+        f"{background}; split: trained on {len(scene.train)} views, held out "
         f"{len(scene.test)}, evaluated on {evaluated} {'held-out' if scene.test else 'training'} views; images "
         f"{_sizes(scene.test or scene.train)}; gsopt {__version__}, torch {torch.__version__}, "
         f"backend {finished.backend.name}."

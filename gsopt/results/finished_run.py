@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt.config.train import TrainConfig
+from gsopt.config.train import BACKGROUNDS, TrainConfig
+from gsopt.data import files
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.resample import premultiply
 from gsopt.data.scene import Scene, View, load_scene
@@ -62,7 +63,7 @@ def open_run(run: Path, backend: str | None = None, threads: int | None = None) 
         gaussians=gaussians,
         backend=backend_of(config, backend, threads),
         settings=RasterSettings(sh_degree=gaussians.sh_degree, antialiased=config.antialiased),
-        background=background_of(config),
+        background=background_of(run),
     )
 
 
@@ -72,9 +73,20 @@ def backend_of(config: TrainConfig, backend: str | None = None, threads: int | N
     return make_backend(backend or config.backend, config.threads if threads is None else threads, device)
 
 
-def background_of(config: TrainConfig) -> Float[Tensor, "3"]:
-    """The background that held-out views are evaluated on."""
-    return torch.tensor(config.data.evaluation_background)
+def background_of(run: Path) -> Float[Tensor, "3"]:
+    """The background that held-out views are evaluated on: the color of the run's plan, or what its settings name where
+    it has none yet. InputError for a plan that is garbled."""
+    document = files.read_json(run / "config.json")
+    plan = document.get("plan")
+    if not isinstance(plan, dict):
+        named = TrainConfig.read(run / "config.json").data.background
+        return torch.tensor(BACKGROUNDS.get(named, BACKGROUNDS["white"]))
+    background = plan.get("background")
+    color = background.get("color") if isinstance(background, dict) else None
+    if not isinstance(color, list) or len(color) != 3:
+        raise InputError(f"`plan.background` in {run / 'config.json'} is no color. Restore the file.")
+    where = f"`plan.background` in {run / 'config.json'}"
+    return torch.tensor([files.number(value, where) for value in color]).clamp(0, 1)
 
 
 def draw(

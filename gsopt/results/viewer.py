@@ -173,7 +173,7 @@ class SplatViewer:
     def add_run(self, run: Path, scene: Scene | None, config: TrainConfig) -> tuple[RunControls, HeldOutViews | None]:
         """Adds progress and stop of a run, and its held-out views."""
         views = scene.test if scene else ()
-        return RunControls(self._server, run), held_out_views(self._server, views, config)
+        return RunControls(self._server, run), held_out_views(self._server, views, config, run)
 
     def stop(self) -> None:
         self._server.stop()

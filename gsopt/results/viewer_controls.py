@@ -45,8 +45,8 @@ def ask_to_stop(run: Path) -> None:
 class HeldOutViews:
     """Truth, render and error of one held-out view, chosen by a slider."""
 
-    def __init__(self, server: Any, views: tuple[View, ...], config: TrainConfig) -> None:
-        self._views, self._config = views, config
+    def __init__(self, server: Any, views: tuple[View, ...], config: TrainConfig, run: Path) -> None:
+        self._views, self._config, self._run = views, config, run
         self._number = 0
         self._gaussians: Gaussians | None = None
         self._backend = backend_of(config)
@@ -70,7 +70,7 @@ class HeldOutViews:
 
     def panes(self, gaussians: Gaussians) -> np.ndarray:
         """[H, 3 W, 3] truth, render and error of the chosen view."""
-        view, background = self._views[self._number], background_of(self._config)
+        view, background = self._views[self._number], background_of(self._run)
         settings = RasterSettings(sh_degree=gaussians.sh_degree, antialiased=self._config.antialiased)
         camera = with_longest_side(view.camera, PANE)
         render = as_image(draw(gaussians, camera, self._backend, settings, background))
@@ -78,9 +78,9 @@ class HeldOutViews:
         return np.concatenate([np.asarray(image) for image in (target, render, error_map(render, target))], axis=1)
 
 
-def held_out_views(server: Any, views: tuple[View, ...], config: TrainConfig) -> HeldOutViews | None:
+def held_out_views(server: Any, views: tuple[View, ...], config: TrainConfig, run: Path) -> HeldOutViews | None:
     """The panel of held-out views, or None where there are none or nothing can draw them."""
     try:
-        return HeldOutViews(server, views, config) if views else None
+        return HeldOutViews(server, views, config, run) if views else None
     except GsoptError:
         return None

@@ -18,7 +18,7 @@ from gsopt.errors import InputError, NumericalError
 from gsopt.events import to_json, write_atomic
 from gsopt.formats.ply import save_ply
 from gsopt.gaussians import Gaussians
-from gsopt.init import first_gaussians
+from gsopt.init.first_gaussians import ENOUGH_AGREED, first_gaussians
 from gsopt.init.guessed_views import with_guessed_views
 from gsopt.init.mask_repair import RepairedMask, load_with_agreeing_masks
 from gsopt.raster.api import make_backend
@@ -33,7 +33,7 @@ from gsopt.training.guided.start import start_guidance
 from gsopt.training.interrupt import StopRequest
 from gsopt.training.library_body import with_library_body
 from gsopt.training.mirror_images import with_recorded_mirrors
-from gsopt.training.plan import RunPlan, guesses
+from gsopt.training.plan import RunPlan, guesses, matches_photos
 from gsopt.training.run_directory import Listener, RunDirectory, opened
 from gsopt.training.shape_prior_body import with_shape_prior_body
 from gsopt.training.trainer import Trainer
@@ -89,6 +89,10 @@ def train(
             scene = with_shape_prior_body(config, scene, backend, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)
+            if matches_photos(config, scene):
+                from gsopt.init.stereo.depths import with_stereo_depths
+
+                scene = with_stereo_depths(scene, ENOUGH_AGREED, config.seed)
             plan = RunPlan.of(config, scene)
             guidance = start_guidance(config, plan, scene, backend, directory)
             require_memory(plan, scene, backend, guidance)
@@ -97,13 +101,13 @@ def train(
             stopped = _advance(trainer, directory, stop, clock)
             _finish(trainer, directory, clock)
             if guidance is not None:
-                guidance.finish(trainer.model.gaussians, trainer.settings())
+                guidance.finish(trainer.result, trainer.settings())
         if stopped or done:
             kind = "stopped" if stopped else "done"
             directory.emit(kind, step=trainer.step, n=len(trainer.model), seconds=round(clock.seconds(), 3))
         return TrainResult(
             run=directory.path,
-            gaussians=trainer.model.gaussians.to("cpu"),
+            gaussians=trainer.result.to("cpu"),
             scene=scene,
             backend=backend.name,
             init=str(directory.recorded("gaussians_init")),
@@ -272,9 +276,12 @@ def is_due(step: int, every: int) -> bool:
 def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
     _save(trainer, directory, clock)
-    save_ply(directory.path / "splat.ply", trainer.model.gaussians.to("cpu"), antialiased=trainer.plan.antialiased)
+    require_finite(trainer.result.items(), trainer.step, _last_good(directory))
+    save_ply(directory.path / "splat.ply", trainer.result.to("cpu"), antialiased=trainer.plan.antialiased)
     if trainer.poses is not None:
         write_atomic(directory.path / "poses.json", to_json(trainer.poses.record(trainer.scene.origin)))
+    if trainer.exposure is not None:
+        write_atomic(directory.path / "exposure.json", to_json(trainer.exposure.record()))
 
 
 def _save(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:

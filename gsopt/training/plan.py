@@ -7,9 +7,11 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gsopt.config.train import DensityConfig, InitConfig, PoseConfig, SparseConfig, TrainConfig
+from gsopt.config.train import DensityConfig, ExposureConfig, InitConfig, PoseConfig, SparseConfig, TrainConfig
 from gsopt.data.background import Background
 from gsopt.data.scene import Scene
+from gsopt.geometry.focus import find_focus
+from gsopt.init.first_gaussians import FEW_PHOTOS
 from gsopt.sds.guidance_plan import GuidancePlans
 from gsopt.sds.select_prior import PriorSelection, select_prior
 from gsopt.training.schedule import Schedule
@@ -28,6 +30,10 @@ MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
 MIRRORED_TIMES_VIEWS = 32
 # Share of a run in which the rates fall, so that it does not end in the noise of the last few views it drew.
 SETTLING_SHARE = 0.05
+# Share of SparseConfig's lambda_opacity without masks: in a scene nothing is transparent, and faded splats are haze.
+OPAQUE_SHARE = 1 / 6
+# Distance to a camera below which gradients are weakened, over the distance to what the cameras look at.
+NEAR_SHARE = 1.5
 # Most memory for float targets, as a share of the decoded images': both hold the same views.
 TARGET_CACHE_SHARE = 0.5
 
@@ -40,6 +46,7 @@ class LossWeights:
     alpha: float
     opacity: float
     scale: float
+    depth: float
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,10 @@ class RunPlan:
     seed: int
     sparse: bool
     """True when the regularizers for few views are on."""
+    opaque: bool
+    """True with few views of a whole scene, no masks: then the Gaussians of the last steps are averaged."""
+    near_distance: float
+    """Distance to a camera below which gradients are weakened, scene units; 0 = never."""
     background: Background
     antialiased: bool
     init: InitConfig
@@ -73,6 +84,7 @@ class RunPlan:
     schedule: Schedule
     density: DensityPlan
     poses: PoseConfig
+    exposure: ExposureConfig
     prior: PriorSelection
     guidance: GuidancePlans
     extra_per_epoch: int
@@ -92,19 +104,22 @@ class RunPlan:
         views = len(scene.train)
         sparse = is_sparse(config.sparse, views)
         iterations = shortened(config, 2 * views if scene.completed else views)
-        background = Background.of(config.data)
+        background = Background.of(config.data, scene)
         budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), iterations)
         schedule = make_schedule(config, iterations, sparse, scene.extent)
         return RunPlan(
             seed=config.seed,
             sparse=sparse,
+            opaque=sparse and not scene.has_alpha,
+            near_distance=near_distance(scene) if sparse and not scene.has_alpha else 0.0,
             background=background,
             antialiased=config.antialiased,
             init=config.init,
-            weights=loss_weights(config, sparse),
+            weights=loss_weights(config, sparse, scene.has_alpha),
             schedule=schedule,
             density=density_plan(config.density, budget, scene.extent),
             poses=config.poses,
+            exposure=config.exposure,
             prior=select_prior(config.guidance),
             guidance=GuidancePlans.of(config.guidance, iterations, config.seed, background),
             extra_per_epoch=extra_per_epoch(scene),
@@ -127,9 +142,21 @@ def is_sparse(config: SparseConfig, views: int) -> bool:
     return views <= config.below_views
 
 
+def near_distance(scene: Scene) -> float:
+    """NEAR_SHARE of the cameras' distance to what they all look at; 0 where they look at no one place."""
+    focus = find_focus([view.camera for view in scene.train], scene.extent)
+    return NEAR_SHARE * focus.distance if focus.converging else 0.0
+
+
 def guesses(config: TrainConfig, views: int) -> bool:
     """True when a single photo is completed by views of its inflated silhouette."""
     return config.sparse.inflate == "auto" and is_sparse(config.sparse, views) and not config.poses.refine
+
+
+def matches_photos(config: TrainConfig, scene: Scene) -> bool:
+    """True when a run learns from the depths on which its photos agree: few photos of a whole scene."""
+    few = 1 < len(scene.train) <= FEW_PHOTOS and is_sparse(config.sparse, len(scene.train))
+    return few and not scene.has_alpha and config.loss.lambda_depth > 0 and config.data.depth is None
 
 
 def shortened(config: TrainConfig, views: int) -> int:
@@ -177,7 +204,7 @@ def refine_stop(config: DensityConfig, iterations: int) -> int:
     return min(published, round(share * iterations))
 
 
-def loss_weights(config: TrainConfig, sparse: bool) -> LossWeights:
+def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool) -> LossWeights:
     """The run's weights: LossConfig's (0.01 for mcmc's two, Kheradmand et al. 2024), or SparseConfig's if larger."""
     loss, few = config.loss, config.sparse
     default = 0.01 if config.density.strategy == "mcmc" else 0.0
@@ -185,9 +212,13 @@ def loss_weights(config: TrainConfig, sparse: bool) -> LossWeights:
     opacity = default if loss.lambda_opacity is None else loss.lambda_opacity
     scale = default if loss.lambda_scale is None else loss.lambda_scale
     if not sparse:
-        return LossWeights(loss.lambda_dssim, alpha, opacity, scale)
-    raised = max(alpha, few.lambda_alpha), max(opacity, few.lambda_opacity), max(scale, few.lambda_scale)
-    return LossWeights(loss.lambda_dssim, *raised)
+        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, loss.lambda_depth)
+    raised = (
+        max(alpha, few.lambda_alpha),
+        max(opacity, few.lambda_opacity * (1 if has_alpha else OPAQUE_SHARE)),
+        max(scale, few.lambda_scale),
+    )
+    return LossWeights(loss.lambda_dssim, *raised, loss.lambda_depth)
 
 
 def density_plan(config: DensityConfig, budget: int, extent: float) -> DensityPlan:

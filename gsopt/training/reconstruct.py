@@ -108,6 +108,7 @@ def _with_absolute_paths(config: TrainConfig) -> TrainConfig:
         config.data,
         path=str(Path(config.data.path).expanduser().absolute()),
         masks=_absolute_masks(config.data.masks),
+        depth=_absolute(config.data.depth) if config.data.depth else None,
         mask_model=_absolute(config.data.mask_model) if config.data.mask_model else None,
     )
     return replace(config, data=data, guidance=guidance)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras
+from gsopt.raster.backend import Gradients
 from gsopt.training.randomness import uniform
 
 # What a left-out Gaussian's logit becomes: an opacity of 4e-44, which every backend culls.
@@ -33,6 +35,19 @@ def add_opacity_gradient(
 def add_scale_gradient(v_log_scales: Float[Tensor, "N 3"], log_scales: Float[Tensor, "N 3"], weight: float) -> None:
     """Add d/dlog_scales of weight · mean(scales): weight/(3N) · scales, in place."""
     v_log_scales.add_(log_scales.exp(), alpha=weight / max(1, log_scales.numel()))
+
+
+def weaken_near(gradients: Gradients, means: Float[Tensor, "N 3"], camera: Cameras, distance: float) -> None:
+    """Scale the gradients of each Gaussian by min(1, (d / distance)²), d its distance to the camera, in place.
+
+    A place is seen by more pixels the nearer it is, so that Gaussians before a lens, which no other photo sees, take
+    the largest share of its gradients and stay there as haze (Philip & Deschaintre 2023, "Floaters No More")."""
+    away = means - camera.centers[0].to(means)
+    factors = (away.square().sum(1) / distance**2).clamp_(max=1)
+    for field in fields(gradients):
+        values = getattr(gradients, field.name)
+        if values is not None:
+            values.mul_(factors.view(-1, *[1] * (values.ndim - 1)))
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsopt.config.train import OptimizerConfig
+from gsopt.training.averaging import SHARE
 from gsopt.training.optimizer import learning_rates
 
 STEPS_AFTER_RESET = 2000
@@ -37,6 +38,11 @@ class Schedule:
     """Share of Gaussians left out of the last step."""
     floater_every: int
     """Steps between two prunings of floaters; 0 = never."""
+
+    @property
+    def averages_after(self) -> int:
+        """The step after which Gaussians are averaged: none are added from there on."""
+        return max(self.refine_stop, *self.coarse_until, self.iterations - round(SHARE * self.iterations))
 
     def learning_rates(self, step: int, last: int) -> dict[str, float]:
         """Rate of every parameter in a run that ends with step `last`; that of the means in scene units per step."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
@@ -30,6 +31,14 @@ class Target:
     """Height and width of the whole image, px, of which this may be a window."""
     color: float = 1.0
     """Weight of the colors in the loss."""
+    inverse_depths: Float[Tensor, "H W"] | None = None
+    """Any scale and shift will do; NaN where unknown, absent (None) without a map."""
+
+    @property
+    def images(self) -> dict[str, Any]:
+        """All that has pixels, by field."""
+        planes = {name: getattr(self, name) for name in ("colors", "alphas", "inverse_depths")}
+        return {name: plane for name, plane in planes.items() if plane is not None}
 
     @property
     def share(self) -> float:
@@ -85,13 +94,13 @@ class Targets:
         colors, alphas = premultiplied(view.pixels(), width, height)
         if self._fixed is not None and alphas is not None:
             colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed)
-        target = Target(
-            view.camera.to(torch.float32).resized(width, height), colors, alphas, (height, width), view.color
-        )
+        camera = view.camera.to(torch.float32).resized(width, height)
+        depths = view.inverse_depths(height, width)
+        target = Target(camera, colors, alphas, (height, width), view.color, depths)
         if not whole:
             target = cropped(target)
         target = moved(target, self._device)
-        size = target.colors.nbytes + (0 if target.alphas is None else target.alphas.nbytes)
+        size = sum(image.nbytes for image in target.images.values())
         if self._bytes + size <= self._budget:
             self._kept[index, whole] = target
             self._bytes += size
@@ -100,8 +109,7 @@ class Targets:
 
 def moved(target: Target, device: torch.device) -> Target:
     """The same with its images on `device`; the camera stays."""
-    alphas = None if target.alphas is None else target.alphas.to(device)
-    return replace(target, colors=target.colors.to(device), alphas=alphas)
+    return replace(target, **{name: image.to(device) for name, image in target.images.items()})
 
 
 def cropped(target: Target) -> Target:
@@ -109,8 +117,8 @@ def cropped(target: Target) -> Target:
     window = content_window(target.alphas)
     if window is None or target.alphas is None:
         return target
-    colors, alphas = window.crop(target.colors), window.crop(target.alphas)
-    return replace(target, camera=window.camera(target.camera), colors=colors, alphas=alphas)
+    images: dict[str, Any] = {name: window.crop(image) for name, image in target.images.items()}
+    return replace(target, camera=window.camera(target.camera), **images)
 
 
 def premultiplied(

@@ -15,14 +15,17 @@ from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.morton import morton_order
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
+from gsopt.training.averaging import RunningAverage
 from gsopt.training.checkpoint import Checkpoint
 from gsopt.training.content_window import draws_whole
 from gsopt.training.density import at_least_one, make_density
+from gsopt.training.exposure import Exposure
 from gsopt.training.floaters import solitary
+from gsopt.training.frame_loss import frame_loss
 from gsopt.training.optimizer import OptimizedGaussians, adam_step
 from gsopt.training.plan import RunPlan
 from gsopt.training.poses import PoseRefinement
-from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, alpha_gradient
+from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, weaken_near
 from gsopt.training.running_means import RunningMeans
 from gsopt.training.schedule import Flatness
 from gsopt.training.skipping import Bands, Resting
@@ -53,6 +56,8 @@ class Trainer:
         self._schedule = plan.schedule
         self._last = plan.schedule.iterations
         self.poses = PoseRefinement(plan.poses, scene, self._last) if plan.poses.refine else None
+        self.exposure = Exposure(plan.exposure, scene, self._last) if plan.exposure.learn else None
+        self._average = RunningAverage(plan.schedule.averages_after) if plan.opaque else None
         self._generators = generators(plan.seed)
         views, images = len(scene.train), len(scene.drawn) - len(scene.train)
         self._order = ViewOrder(views, self._generators["views"], images, plan.extra_per_epoch)
@@ -87,13 +92,15 @@ class Trainer:
         settings = self.settings()
         if self.poses is not None:
             target = replace(target, camera=self.poses.camera(index, target.camera))
-        loss, gradients = self._gradients(target, background, settings)
+        loss, gradients = self._gradients(index, target, background, settings)
         if self.poses is not None:
             self.poses.update(index, self.step, self.model.gaussians, gradients, settings.sh_degree)
         if self._guidance is not None:
             self._guidance.add(self.step, self.model.gaussians, settings, gradients)
         self._update(gradients, target.camera, settings)
         self._change_set()
+        if self._average is not None:
+            self._average.note(self.step, self.model.gaussians)
         self._resting.note(index, loss)
         self._end_when_flat(loss)
         return loss, self.scene.drawn[index].name
@@ -117,30 +124,28 @@ class Trainer:
         return RasterSettings(sh_degree=degree, antialiased=self.plan.antialiased)
 
     def _gradients(
-        self, target: Target, background: Float[Tensor, "3"], settings: RasterSettings
+        self, index: int, target: Target, background: Float[Tensor, "3"], settings: RasterSettings
     ) -> tuple[float, Gradients]:
         """Forward, loss, backward, regularizers; density control takes note."""
-        weights = self.plan.weights
         dropout = self._dropout()
         drawn = self.model.gaussians if dropout is None else dropout.drawn
-        frame = self.backend.forward(drawn, target.camera, settings, background)
-        photometric = self.backend.photometric(frame.colors, target.colors, weights.dssim)
-        v_alphas = None
-        if weights.alpha > 0 and target.alphas is not None:
-            v_alphas = alpha_gradient(frame.alphas, target.alphas, weights.alpha * target.share)
-        weight = target.share * target.color
-        v_colors = photometric.v_colors if weight == 1 else photometric.v_colors.mul_(weight)
+        depth = self.plan.weights.depth > 0 and target.inverse_depths is not None
+        frame = self.backend.forward(drawn, target.camera, settings, background, depth=depth)
+        row = None if self.exposure is None else self.exposure.row(index)
+        loss = frame_loss(self.backend, frame, target, self.plan.weights, background, self.exposure, row, self.step)
         bands = self._guidance is not None and self._guidance.is_due(self.step)  # which adds its own to them
         absgrad = self._wants_absgrad()
-        gradients = self.backend.backward(frame, v_colors, v_alphas, absgrad=absgrad, bands=bands, into=self._spent)
+        through = loss.v_colors, loss.v_alphas, loss.v_depths
+        gradients = self.backend.backward(frame, *through, absgrad=absgrad, bands=bands, into=self._spent)
         self._spent = gradients
+        if self.plan.near_distance > 0:
+            weaken_near(gradients, self.model.gaussians.means, target.camera, self.plan.near_distance)
         self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])
         if self.plan.residual_bands and self._bands.watches(self.step):
             self._bands.note(self.model.gaussians, target.camera, gradients)
-        loss = photometric.loss * weight
         if target.color == 1:
-            self.means.update(self.step, loss, frame.colors, target)
-        return loss, self._regularized(gradients, dropout)
+            self.means.update(self.step, loss.photometric, frame.colors, target)
+        return loss.photometric, self._regularized(gradients, dropout)
 
     def _wants_absgrad(self) -> bool:
         """True when adc will read absolute gradients of this step."""
@@ -190,6 +195,13 @@ class Trainer:
     def _select(self, rows: Tensor) -> None:
         self.model = self.model.select(rows)
         self._density.select(rows)
+        if self._average is not None:
+            self._average.select(rows)
+
+    @property
+    def result(self) -> Gaussians:
+        """The Gaussians that a run hands on: with few opaque photos their mean over the last steps."""
+        return self.model.gaussians if self._average is None else self._average.of(self.model.gaussians)
 
     @property
     def finished(self) -> bool:
@@ -239,6 +251,10 @@ class Trainer:
             tensors |= {f"guidance.{name}": tensor for name, tensor in guiding.items()}
         if self.poses is not None:
             tensors |= {f"poses.{name}": tensor for name, tensor in self.poses.tensors().items()}
+        if self._average is not None:
+            tensors |= {f"average.{name}": tensor for name, tensor in self._average.tensors().items()}
+        if self.exposure is not None:
+            tensors |= {f"exposure.{name}": tensor for name, tensor in self.exposure.tensors().items()}
         return tensors, meta
 
     def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -260,6 +276,10 @@ class Trainer:
             self._guidance.restore(_part(tensors, "guidance."), meta["guidance"])
         if self.poses is not None:
             self.poses.restore(_part(tensors, "poses."))
+        if self._average is not None:
+            self._average.restore(_part(tensors, "average."), gaussians)
+        if self.exposure is not None:
+            self.exposure.restore(_part(tensors, "exposure."))
         for name, generator in self._generators.items():
             generator.set_state(tensors[f"rng.{name}"])
         order = _views(tensors["epoch.order"], len(self.scene.drawn))
@@ -279,7 +299,7 @@ def _record(tensors: dict[str, Tensor], kind: str) -> Gaussians:
 def _require_alike(tensors: dict[str, Tensor], own: dict[str, Tensor]) -> None:
     """Dtypes and shapes of a fresh trainer with as many Gaussians; those of the epoch and of guidance vary."""
     for name, tensor in own.items():
-        varies = name == "epoch.order" or name.startswith("guidance.")
+        varies = name == "epoch.order" or name.startswith(("guidance.", "average."))
         if not varies and (tensors[name].dtype, tensors[name].shape) != (tensor.dtype, tensor.shape):
             raise ValueError(f"the shape of {name}")
 

@@ -35,7 +35,7 @@ def imperfect(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_splats_that_made_the_truth_are_perfect(perfect: Path) -> None:
     metrics = evaluate(perfect)
-    assert metrics["mean"] == {"psnr": PSNR_CAP, "ssim": 1.0, "lpips_alex": 0.0}
+    assert metrics["mean"] == {"psnr": PSNR_CAP, "ssim": 1.0, "lpips_alex": 0.0, "cc_psnr": PSNR_CAP}
     assert [row["name"] for row in metrics["per_view"]] == ["test/r_0.png", "test/r_1.png"]
     assert metrics["reason"] is None
     assert metrics["train"] is None
@@ -248,3 +248,4 @@ def test_the_object_is_measured_where_a_view_has_alpha(
     drawn = evaluate_views(run.gaussians, [masked], run.backend, run.settings, run.background, None)
     assert drawn["per_view"][0].get("psnr_object", "absent") == expected
     assert drawn["mean"].get("psnr_object", "absent") == expected
+    assert ("cc_psnr_object" in drawn["mean"]) == (alpha is not None)

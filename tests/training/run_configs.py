@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from PIL import Image
 from tiny_scenes import tiny_config
 
 from gsopt.config.train import (
     DataConfig,
     DensityConfig,
+    ExposureConfig,
+    InitConfig,
     OptimizerConfig,
     PoseConfig,
     ScheduleConfig,
     SparseConfig,
     TrainConfig,
 )
+
+
+def opaque(dataset: Path) -> Path:
+    """The same photos on gray, without alpha."""
+    folder = dataset.parent / "opaque"
+    if not folder.exists():
+        shutil.copytree(dataset, folder)
+        for path in folder.glob("*/*.png"):
+            photo = Image.open(path)
+            Image.alpha_composite(Image.new("RGBA", photo.size, (90, 110, 130, 255)), photo).convert("RGB").save(path)
+    return folder
 
 
 def configs(dataset: Path) -> dict[str, TrainConfig]:
@@ -30,6 +45,10 @@ def configs(dataset: Path) -> dict[str, TrainConfig]:
         "reference backend": replace(base, backend="reference"),
         "refined poses": replace(
             base, poses=PoseConfig(refine=True, start=3, lr=3e-3), sparse=SparseConfig(below_views=0)
+        ),
+        "learned exposure": replace(base, exposure=ExposureConfig(learn=True, start=3)),
+        "opaque photos": replace(
+            base, data=DataConfig(path=str(opaque(dataset))), init=InitConfig(method="random", count=60), iterations=60
         ),
         "coarse to fine": replace(base, schedule=ScheduleConfig(coarse_until=(12,), stop_when_flat=True)),
         "skipping": replace(

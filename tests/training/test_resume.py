@@ -51,6 +51,8 @@ NAMES = (
     "coarse to fine",
     "skipping",
     "refined poses",
+    "learned exposure",
+    "opaque photos",
 )
 
 

@@ -32,6 +32,9 @@ class Picture:
         self.reads += 1
         return self.values
 
+    def inverse_depths(self, height: int, width: int) -> None:
+        """No map."""
+
 
 def pictures(channels: int, count: int = 3, height: int = 6, width: int = 10) -> list[Picture]:
     generator = torch.Generator().manual_seed(channels)

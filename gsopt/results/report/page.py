@@ -20,10 +20,22 @@ NO_VALUE = "\N{EN DASH}"
 """Replaces a missing value."""
 TURNTABLE_FPS = 12.0
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS (Alex)"}
-OPTIONAL_TITLES = {"lpips_vgg": "LPIPS (VGG)", "psnr_object": "PSNR of the object"}
+OPTIONAL_TITLES = {
+    "lpips_vgg": "LPIPS (VGG)",
+    "cc_psnr": "PSNR, color-corrected",
+    "psnr_object": "PSNR of the object",
+    "cc_psnr_object": "the same, color-corrected",
+}
 """Metrics that somebody asked for, and inside masks where the views have some."""
-HINTS = {"psnr": "dB, higher is better", "ssim": "higher is better", "psnr_object": "dB inside the masks"}
-DIGITS = {"psnr": 2, "ssim": 4, "lpips_alex": 4, "lpips_vgg": 4, "psnr_object": 2}
+HINTS = {
+    "psnr": "dB, higher is better",
+    "ssim": "higher is better",
+    "cc_psnr": "dB after a fit of exposure and white balance",
+    "psnr_object": "dB inside the masks",
+    "cc_psnr_object": "dB inside the masks after this fit",
+}
+DIGITS = {"ssim": 4, "lpips_alex": 4, "lpips_vgg": 4}
+"""Decimals; those of a PSNR are 2."""
 # A page loads nothing: images are data URIs, styles are inline, and there are no scripts but the viewer's.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
@@ -247,7 +259,7 @@ def footer(report: Report) -> str:
 
 
 def figure(key: str, value: float | None) -> str:
-    return NO_VALUE if value is None else f"{value:.{DIGITS[key]}f}"
+    return NO_VALUE if value is None else f"{value:.{DIGITS.get(key, 2)}f}"
 
 
 def duration(seconds: float) -> str:
