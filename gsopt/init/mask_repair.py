@@ -43,6 +43,7 @@ KINDS = {
 }
 REPAIRS = {
     "colors": "found again by color inside the hull of the others",
+    "cleared": "cleared, since the hull of the others lies outside the photo, which does not show the object",
     "hull": "replaced by the projected hull of the others, since colors do not tell the object from its surroundings",
 }
 
@@ -122,11 +123,14 @@ def _repaired(
     found = {}
     for row in agreement.disagreeing:
         kind = _kind(agreement, row) if views[row].pixels().shape[2] == 4 else "missing"
-        hull = agreement.projection(row)
+        hull, camera = agreement.projection(row), views[row].camera
+        if not bool(hull.any()):
+            finding = RepairedMask(views[row].name, kind, agreement.covered[row], "cleared")
+            found[row] = torch.zeros(camera.height, camera.width, dtype=torch.uint8), finding
+            continue
         colors = small_photos([unmasked[row]], 1)[0].planes[:3]
         by_color = _colored_part(colors, hull, agreement.thickness(row), inside, agreement.photos[row], kind)
         fits = _agrees(agreement, row, by_color) and float(by_color.sum()) > LEAST_SHARE * float(hull.sum())
-        camera = views[row].camera
         alpha = _enlarged(by_color if fits else cleaned(hull), camera.height, camera.width)
         finding = RepairedMask(views[row].name, kind, agreement.covered[row], "colors" if fits else "hull")
         found[row] = alpha, finding
