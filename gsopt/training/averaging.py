@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from gsopt import check
 from gsopt.gaussians import PARAMETERS, Gaussians
 
 SHARE = 1 / 8
@@ -52,9 +53,9 @@ class RunningAverage:
         return {"count": torch.tensor(self.count), **self._mean}
 
     def restore(self, tensors: dict[str, Tensor], gaussians: Gaussians) -> None:
-        """Inverse of `tensors`. Raises ValueError for a mean that does not fit the Gaussians."""
+        """Inverse of `tensors`. Raises InputError for a mean that does not fit the Gaussians."""
         self.count = int(tensors["count"])
         self._mean = {name: tensors[name].to(gaussians.means.device) for name in PARAMETERS if self.count > 0}
         for name, values in gaussians.items():
-            if self.count > 0 and self._mean[name].shape != values.shape:
-                raise ValueError(f"the shape of average.{name}")
+            if self.count > 0:
+                check.shape(f"average.{name}", self._mean[name], tuple(values.shape))

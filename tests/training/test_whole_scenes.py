@@ -46,7 +46,7 @@ def test_the_average_is_the_mean_of_what_it_noted_beside_each_gaussian() -> None
     copy = RunningAverage(first=EVERY)
     copy.restore(average.tensors(), seen[3].select(rows))
     assert copy.tensors().keys() == average.tensors().keys()
-    with pytest.raises(ValueError, match=r"average\.means"):
+    with pytest.raises(InputError, match=r"average\.means"):
         copy.restore(average.tensors(), seen[3])
 
 
