@@ -6,7 +6,8 @@
 # BLENDER_PYTHON has bpy; MESHES holds MANIFEST.json and the meshes it lists; SPLITS is a JSON file with the names under
 # `train` and `val`; LIBRARIES are the unpacked archives of sweethome3d-furniture (more_models.py). Interrupted, the same
 # command goes on. Each course ran before the next was thought of, with the first shapes, the mirror images and the loss of
-# its time: what this makes today is not the same to the bit.
+# its time: what this makes today is not the same to the bit. The weights were rounded to 8 significant bits afterwards
+# (gsopt/finetune/half_precision.py).
 set -eu
 blender_python=$1 meshes=$2 splits=$3 libraries=$4 out=$5
 mkdir -p "$out"

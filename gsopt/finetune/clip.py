@@ -18,6 +18,7 @@ from torch import Tensor
 from gsopt._optional import require
 from gsopt.events import Report
 from gsopt.finetune.captions import generic_texts
+from gsopt.finetune.half_precision import in_half_precision
 from gsopt.finetune.pair_cache import PairCache
 from gsopt.sds.noise import generator
 from gsopt.sds.priors.clip import CLIP_MEAN, CLIP_STD, MAX_TOKENS
@@ -160,7 +161,7 @@ def _picture(cache: PairCache, scene: int, random: torch.Generator) -> Float[Ten
 
 def save_clip(model: Any, tokenizer: Any, folder: Path) -> None:
     """Writes a folder that transformers reads, in half precision (converts `model` in place)."""
-    model.half().save_pretrained(folder, safe_serialization=True)
+    in_half_precision(model).save_pretrained(folder, safe_serialization=True)
     tokenizer.save_pretrained(folder)
     for file in folder.iterdir():
         file.chmod(0o644)

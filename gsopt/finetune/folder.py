@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 
 from gsopt.data.files import is_regular, read_json
+from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
+from gsopt.finetune.half_precision import in_half_precision
 from gsopt.finetune.scenes import TrainingScenes
 from gsopt.finetune.training_config import PriorTrainingConfig
 from gsopt.sds.priors.view_conditioned import CARD_FILE, NOISE_STEPS
@@ -29,7 +32,10 @@ def write_folder(
     evaluation: Mapping[str, Any],
 ) -> None:
     """Writes unet/ in half precision (converts `unet` in place), the noise schedule, gsopt_prior.json and the card."""
-    unet.half().save_pretrained(out / "unet", max_shard_size=LARGEST_SHARD, safe_serialization=True)
+    try:
+        in_half_precision(unet).save_pretrained(out / "unet", max_shard_size=LARGEST_SHARD, safe_serialization=True)
+    except SafetensorError as error:
+        raise InputError(f"{out / 'unet'}: {error}. Make room, then give the same command again.") from error
     unet_config = read_json(out / "unet" / "config.json")
     unet_config.pop("_name_or_path", None)  # the path of the base on this machine is private
     write_atomic(out / "unet" / "config.json", to_json(unet_config))

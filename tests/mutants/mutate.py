@@ -30,6 +30,7 @@ FOLDERS = {
     "gsopt/init": "tests/init",
     "gsopt/results": "tests/results",
     "gsopt/events.py": "tests/test_events.py tests/training",
+    "gsopt/metrics.py": "tests/test_metrics.py tests/training",
     "blender_addon/core": "tests/blender",
 }
 """Modules, and the tests that mirror them."""
@@ -152,7 +153,11 @@ def changed_since(commit: str) -> list[Path]:
 
 
 def tests_of(file: str) -> list[str]:
-    return next((tests.split() for folder, tests in FOLDERS.items() if file.startswith(folder)), [])
+    """The tests that mirror the module's folder; those named after the module come first."""
+    folders = next((tests.split() for folder, tests in FOLDERS.items() if file.startswith(folder)), [])
+    word = Path(file).stem.strip("_").split("_")[0]
+    named = [str(test.relative_to(ROOT)) for folder in folders for test in (ROOT / folder).rglob(f"test_*{word}*.py")]
+    return [*named, *folders]
 
 
 def noticed(mutant: Mutant, copy: Path) -> bool:

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from gsopt.config.guidance import GuidanceConfig
+from gsopt.finetune.half_precision import rounded
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.priors.protocol import Condition
 from gsopt.sds.priors.view_conditioned import ViewPrior
@@ -31,6 +33,13 @@ def test_the_folder_is_small_and_says_what_it_is(embedded: Path) -> None:
     assert (embedded / "train.jsonl").read_text().count("\n") > 5
     measured = json.loads((embedded / "gsopt_prior.json").read_text())["measured"]
     assert max(measured["repair"].values()) > measured["render"]
+
+
+def test_its_weights_have_few_bits_for_archives_to_keep(embedded: Path) -> None:
+    for file in embedded.rglob("*.safetensors"):
+        for name, weights in load_file(file).items():
+            if weights.is_floating_point():
+                assert torch.equal(weights, rounded(weights)), name
 
 
 def test_nothing_it_learned_from_is_a_test_object(shared_data: Path, embedded: Path) -> None:
