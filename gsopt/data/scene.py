@@ -24,7 +24,7 @@ from gsopt.data.resample import downscaled_size
 from gsopt.data.split import split
 from gsopt.data.transforms import read_transforms
 from gsopt.data.undistort import Undistortion, choose_pinhole
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.voxels import Grid
 
@@ -32,6 +32,8 @@ FAR_FROM_ORIGIN = 1e3
 """Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""
 MAX_COORDINATE = 1e18
 """Its square is finite in float32."""
+LEAST_SIDE = 16
+"""Shorter side below which no divisor may take an image, px: somebody gave the size that they want."""
 FARTHEST_POINT = 1e6
 """Points farther from their median than this many median distances are left out: in float32 they overflow, or all
 others fall on one place."""
@@ -257,6 +259,11 @@ def _prepare(
     """The source of the frame's pixels, the pinhole K at working size, and True when there is alpha."""
     path, stored = _stored_image(root, frame, factor)
     width, height = (downscaled_size(extent, factor) for extent in (frame.width, frame.height))
+    if min(width, height) < LEAST_SIDE <= min(frame.width, frame.height) / 4:
+        raise UsageError(
+            f"`--resolution` divides width and height: {factor} leaves {width} x {height} px of {frame.name}, "
+            f"{frame.width} x {frame.height} px. Give 2 for half the size, 4 for a quarter."
+        )
     K, undistortion = _resized(frame.K, (frame.width, frame.height), stored), None
     if not frame.lens.is_pinhole:
         key = (frame.lens, tuple(K.flatten().tolist()), stored)

@@ -15,6 +15,7 @@ from plyfile import PlyData, PlyElement
 from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.data.undistort import choose_pinhole
+from gsopt.errors import UsageError
 from gsopt.geometry.projection import sees
 
 
@@ -192,6 +193,13 @@ def test_an_image_is_never_taken_for_its_own_mask(tmp_path: Path) -> None:
     document["frames"][1]["file_path"] = "../a.png"
     write_json(root, document)
     assert all(source.mask is None for source in load_scene(root).train[0].store.sources)
+
+
+def test_a_size_given_for_a_divisor_is_refused(tmp_path: Path) -> None:
+    nerfstudio(tmp_path, size=(100, 80))
+    with pytest.raises(UsageError, match=r"`--resolution` divides .* 50 leaves 2 x 2 px of .*, 100 x 80 px"):
+        load_scene(DataConfig(path=str(tmp_path), downscale=50))
+    assert load_scene(DataConfig(path=str(tmp_path), downscale=5)).train[0].camera.width == 20
 
 
 @pytest.mark.parametrize(("factor", "size"), [(1, (30, 21)), (2, (15, 11)), (4, (8, 5)), (64, (1, 1))])
