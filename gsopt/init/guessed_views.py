@@ -17,6 +17,7 @@ from gsopt.geometry.focus import world_up
 from gsopt.geometry.sh import sh0_from_rgb
 from gsopt.geometry.voxels import Grid
 from gsopt.init.inflation import inflated, object_box
+from gsopt.init.rim_colors import without_rim
 from gsopt.init.surface_colors import seen_colors, unoccluded_colors
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.backend import Backend, RasterSettings
@@ -88,7 +89,7 @@ def drawn_voxels(
     """The shape in the photos' colors, which go straight through it, or in colors of its own where no photo shows it:
     straight sRGB color and alpha."""
     points = grid.surface()
-    colors = unoccluded_colors(grid, photos, points)
+    colors = unoccluded_colors(grid, [without_rim(photo) for photo in photos], points)
     if unseen is not None:
         own = unseen[tuple(((points - grid.low) / grid.voxel).long().T)]
         colors = torch.where(seen_colors(grid, photos, points)[1][:, None], colors, own)

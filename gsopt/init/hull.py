@@ -21,6 +21,7 @@ from gsopt.geometry.focus import Focus, find_focus
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated, eroded
 from gsopt.init.inflation import inflated
+from gsopt.init.rim_colors import without_rim
 from gsopt.init.rounded_hull import rounded
 from gsopt.init.surface_colors import unoccluded_colors
 from gsopt.init.thumbnails import Thumbnail, sample, small_photos
@@ -75,7 +76,7 @@ def hull_points(scene: Scene, count: int, generator: torch.Generator) -> HullPoi
     xyz = _sample_points(grid, photos, count, generator)
     if len(xyz) == 0:
         return None
-    colored = [photo for photo in photos if photo.colored]
+    colored = [without_rim(photo) if scene.guessed else photo for photo in photos if photo.colored]
     return HullPoints(xyz, unoccluded_colors(grid, colored, xyz), len(photos), grid.voxel)
 
 
