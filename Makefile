@@ -20,10 +20,10 @@ SOURCES := pyproject.toml constraints.txt \
 
 .DEFAULT_GOAL := demo
 .NOTPARALLEL:
-.PHONY: demo test lint bench stress sanitize test-interop test-sd21 test-llm test-ray test-blender test-blender-gui blender-extension
+.PHONY: demo test lint bench stress sanitize test-interop test-sd21 test-llm test-ray test-blender test-blender-gui blender-extension every-write fuzz fuzz-peers mutants wheel
 
 demo: $(VENV)/.for-demo
-	$(PY) -m gsopt demo $(if $(RUN),-m "$(RUN)")
+	$(VENV)/bin/gsopt demo $(if $(RUN),-m "$(RUN)")
 
 test: lint
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadgroup
@@ -53,6 +53,11 @@ SECONDS ?= 110
 fuzz: $(VENV)/.for-test
 	$(PIP) atheris
 	$(PY) tests/fuzz/campaign.py $(SECONDS)
+
+# Random changes of the code, COUNT of them, one at a time: does a test notice? An hour for about 60 on one core.
+COUNT ?= 60
+mutants: $(VENV)/.for-test
+	$(PY) tests/mutants/mutate.py --count $(COUNT) --json experiments/results/mutants.json
 
 # Wheels in dist/ that need no compiler to install. PYTHON312: any Python from 3.12 on.
 PYTHON312 ?= python3.12
@@ -97,6 +102,10 @@ SPLAT_TRANSFORM := @playcanvas/splat-transform@3.7.0
 test-interop: build/interop/node_modules/.bin/splat-transform $(VENV)/.for-test
 	test -f build/interop/run/splat.ply || OMP_NUM_THREADS=1 $(PY) -m gsopt demo -m build/interop/run
 	OMP_NUM_THREADS=1 $(PY) experiments/interop.py build/interop/run --splat-transform $< --draw
+
+# Do gsopt's readers and splat-transform read the same splats in damaged files? COUNT files per format.
+fuzz-peers: build/interop/node_modules/.bin/splat-transform $(VENV)/.for-test
+	$(PY) tests/fuzz/differential.py $< --count $(COUNT)
 
 build/interop/node_modules/.bin/splat-transform:
 	npm install --prefix build/interop --no-save --no-audit --no-fund $(SPLAT_TRANSFORM)
@@ -144,8 +153,12 @@ $(VENV)/.build-tools: constraints.txt
 	$(PIP) scikit-build-core nanobind cmake ninja
 	touch $@
 
+# A wheel in dist/ that fits this Python and is no older than the sources saves the compiler.
 $(VENV)/.for-demo: $(VENV)/.build-tools $(SOURCES)
-	$(INSTALL) .
+	for wheel in dist/gsopt-*.whl; do \
+	  test -f "$$wheel" && test -z "$$(find $(SOURCES) gsopt -type f -newer "$$wheel" ! -name "*.pyc" ! -name "*.so" -print -quit)" && \
+	  $(PIP) "$$wheel" && exit; \
+	done; $(INSTALL) .
 	touch $@
 
 $(VENV)/.for-test: $(VENV)/.build-tools $(SOURCES)
