@@ -46,6 +46,8 @@ class RunConsole:
         match event["kind"]:
             case "started":
                 self.say(started_line(event, self._run))
+                if (expected := event.get("estimate")) is not None:
+                    self.say(estimate_line(expected))
                 if (guidance := event.get("guidance")) is not None and guidance["prior"] is None:
                     self.say(f"guidance off: {guidance['reason']}")
                 self._tenths = _tenths(event)
@@ -129,6 +131,12 @@ def started_line(event: Mapping[str, Any], run: Path) -> str:
         few += f", one photo: {guessed} guessed views of its inflated silhouette"
     begin = f"resumed at step {event['step']}" if event["step"] else f"init {event['init']}"
     return f"backend {event['backend']} | {views}{few} | {begin} | {event['n']:,} Gaussians | {run}"
+
+
+def estimate_line(expected: Mapping[str, Any]) -> str:
+    """Returns what the run will take, as far as that is known."""
+    time = f", {clock(expected['cpu_seconds'])} of one core" if "cpu_seconds" in expected else ""
+    return f"estimate: about {expected['memory_mb'] / 1000:.1f} GB of memory{time}"
 
 
 def progress_line(event: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ from gsopt.errors import UsageError
 RUNS = Path("runs")
 
 # Flags that may stand beside --resume when DATA does not: they choose where and how fast, not what.
-WITH_RESUME = ("run", "resume", "vgg", "threads", "checkpoint_every", "preview_every")
+WITH_RESUME = ("run", "resume", "vgg", "threads", "max_memory", "checkpoint_every", "preview_every")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -95,7 +95,7 @@ def recorded_config(flags: Flags, run: Path) -> TrainConfig:
             f"`{refused[0]}` was given with --resume, which takes all settings from {run / 'config.json'}. Drop what "
             "is given there, or give DATA and all flags of the run again."
         )
-    free = ("threads", "checkpoint_every", "preview_every")
+    free = ("threads", "max_memory", "checkpoint_every", "preview_every")
     values = {name: getattr(flags.settings, name) for name in free if name in given}
     return replace(TrainConfig.read(run / "config.json"), **values)
 

@@ -52,6 +52,7 @@ FLAGS = {
     "guidance.ref_image": "--ref-image FILE",
     "poses.refine": "--refine-poses",
     "exposure.learn": "--exposure",
+    "max_memory": "--max-memory 8GB",
 }
 """Flag, short form and metavar of a setting; every other one is its own flag: --optimizer.lr-last."""
 POSITIONAL = "data.path"

@@ -42,12 +42,14 @@ def main(argv: Sequence[str]) -> int:
     check.at_least("--time-limit", flags.time_limit, 1.0, "Give seconds.")
     memory = check.byte_count("--max-memory", flags.max_memory) if flags.max_memory else None
 
+    bound = ("--max-memory", flags.max_memory) if flags.max_memory else ()
+
     from gsopt.cli.train import read_flags
     from gsopt.cli.train_flags import flags_in_errors, parse
     from gsopt.farm.open import available_cores, open_farm
     from gsopt.many_scenes.scenes import read_scenes
 
-    scenes = read_scenes(flags.scenes, tuple(words[at + 1 :]))
+    scenes = read_scenes(flags.scenes, bound + tuple(words[at + 1 :]))
     for settings in {scene.flags: scene for scene in scenes}.values():  # a wrong flag is noticed now
         with flags_in_errors():
             read_flags(parse([str(settings.data), *settings.flags]))

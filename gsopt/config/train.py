@@ -294,6 +294,9 @@ class TrainConfig:
     """GPU to take, as cuda:1, or cpu; left open, torch's current GPU."""
     threads: Threads = 0
     """Number of threads, 0 = one per core. The result does not depend on it."""
+    max_memory: str = ""
+    """Memory that a run on the CPU may need, as 8GB; one that is estimated to need more is refused before its first
+    step. Left open, the memory that is free."""
     antialiased: bool = False
     """Mip-Splatting's 2D filter."""
     checkpoint_every: Count = 1000
@@ -304,6 +307,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check.fields(self)
         check.device(self.device)
+        if self.max_memory:
+            check.byte_count("--max-memory", self.max_memory)
 
     @staticmethod
     def of(preset: Preset = "default", iterations: int | None = None, **changes: Any) -> TrainConfig:

@@ -26,6 +26,7 @@ from gsopt.raster.backend import Backend
 from gsopt.raster.device.memory import PRIOR_BYTES, Memory
 from gsopt.raster.threads import one_torch_thread
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
+from gsopt.training.estimate import estimate, memory_limit
 from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.finite import require_finite, require_finite_loss
 from gsopt.training.guided.session import RunGuidance
@@ -95,7 +96,8 @@ def train(
                 scene = with_stereo_depths(scene, ENOUGH_AGREED, config.seed)
             plan = RunPlan.of(config, scene)
             guidance = start_guidance(config, plan, scene, backend, directory)
-            require_memory(plan, scene, backend, guidance)
+            expected = require_memory(config, plan, scene, backend, guidance)
+            directory.record(estimate=expected)
             trainer, clock = _start(plan, scene, backend, directory, guidance, began)
             _report_masks(repaired, directory)
             stopped = _advance(trainer, directory, stop, clock)
@@ -135,10 +137,21 @@ def require_readable(views: Sequence[View]) -> None:
         view.pixels()
 
 
-def require_memory(plan: RunPlan, scene: Scene, backend: Backend, guidance: RunGuidance | None) -> None:
-    """Raise NumericalError before the first step where the GPU's memory will not do."""
+def require_memory(
+    config: TrainConfig, plan: RunPlan, scene: Scene, backend: Backend, guidance: RunGuidance | None
+) -> dict[str, float] | None:
+    """Raise InputError or NumericalError before the first step where memory, or the GPU's, will not do.
+
+    Returns the estimate of memory, and on the CPU without guidance of the time, or None for the reference.
+    """
+    if backend.name == "cpu":
+        expected = estimate(config, plan, scene)
+        if (limit := memory_limit(config)) is not None:
+            expected.require(limit)
+        found: dict[str, float] = {"memory_mb": round(expected.memory / 1e6)}
+        return found if guidance is not None else {**found, "cpu_seconds": round(expected.seconds)}
     if backend.device.type != "cuda":
-        return
+        return None
     views = scene.drawn
     pixels = max(view.camera.width * view.camera.height for view in views)
     every = sum(16 * view.camera.width * view.camera.height for view in views)
@@ -147,6 +160,7 @@ def require_memory(plan: RunPlan, scene: Scene, backend: Backend, guidance: RunG
     prior = PRIOR_BYTES if guidance is not None else 0
     memory = Memory.of(plan.density.max_gaussians, plan.schedule.max_sh_degree, pixels, targets, prior)
     memory.require(backend.device, free)
+    return {"memory_mb": round(memory.total / 1e6)}
 
 
 @contextmanager
@@ -229,6 +243,7 @@ def _start(
         guessed=len(scene.guessed),
         sparse=plan.sparse,
         guidance=directory.recorded("guidance"),
+        estimate=directory.recorded("estimate"),
         setup_cpu_seconds=round(time.process_time() - began, 3),
     )
     for warning in scene.warnings + few_photo_warnings(scene):

@@ -22,7 +22,7 @@ Listener = Callable[[Mapping[str, Any]], None]
 WORK = ("splat.ply", "metrics.json", "report.html", "previews/*", "checkpoints/*.safetensors")
 # Settings that may differ when a run is resumed: they do not change a bit of the result, but for backend and device, of
 # which each has bits of its own: a run must not be lost with its GPU.
-FREE = ("threads", "checkpoint_every", "preview_every", "data.cache_mb", "backend", "device")
+FREE = ("threads", "max_memory", "checkpoint_every", "preview_every", "data.cache_mb", "backend", "device")
 # Names of files before they are whole: a dot, the name, the process; and what safetensors takes.
 TEMPORARY = re.compile(r"\..+\.\d+\.tmp|\.tmp\w{6}")
 PACKAGES = ("torch", "numpy", "pillow", "safetensors")
