@@ -1,4 +1,4 @@
-"""What Ray adds to local processes: 64 jobs of one second on two cores, paired and repeated; and what a job costs a driver.
+"""The cost of Ray beside local processes: 64 jobs of one second on two cores, in pairs; and what a job costs a driver.
 
     PYTHONPATH=. python experiments/farm_overhead.py
 

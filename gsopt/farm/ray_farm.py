@@ -46,6 +46,7 @@ class RayFarm:
         self._own = not self._ray.is_initialized()
         if self._own:
             self._connect()
+        self._perform = self._ray.remote(max_retries=MAX_RETRIES)(perform)  # once: Ray keeps workers per function
 
     def __str__(self) -> str:
         nodes = [node["Resources"].get("CPU", 0) for node in self._nodes()]
@@ -131,8 +132,8 @@ class RayFarm:
         spec |= {"inputs": [], "stamps": {str(path): stamp(path) for path in job.inputs}}
         spec |= {"writes": [str(path) for path in job.writes], "transfer": self.transfer, "gsopt": __version__}
         memory = {} if job.memory is None else {"memory": job.memory}
-        remote = self._ray.remote(num_cpus=job.cpus, max_retries=MAX_RETRIES, **memory)(perform)
-        return remote.remote(spec, marks, dict(sent))
+        task = self._perform.options(num_cpus=job.cpus, **memory)
+        return task.remote(spec, marks, dict(sent))
 
     def _send(self, path: Path) -> Any:
         """The input in the object store, put there once."""

@@ -80,12 +80,12 @@ def of_sizes(gaussians: int, sh_degree: int, pixels: int, images: int, steps: in
 
 
 def memory_limit(config: TrainConfig) -> int | None:
-    """Bytes that the run may take: `--max-memory`, else what is free; None where the system does not report it."""
+    """Bytes that the run may take: `--max-memory`, else what is free, or None on a system that does not report it."""
     return check.byte_count("--max-memory", config.max_memory) if config.max_memory else free_memory()
 
 
 def free_memory(root: Path = Path("/")) -> int | None:
-    """Bytes that this machine, or the container around this process, has left; None where it is not reported."""
+    """Bytes that this machine, or the container around this process, has left, or None without a report of them."""
     found: list[int] = []
     with contextlib.suppress(OSError, ValueError, IndexError, StopIteration):
         lines = (root / "proc/meminfo").read_text(encoding="ascii").splitlines()
