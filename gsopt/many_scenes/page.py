@@ -65,7 +65,8 @@ def _mean(done: Sequence[dict[str, Any]]) -> str:
     held_out = [value for value in judged if value is not None]
     if not held_out:
         return "No scene has held-out views: figures are of the input views. Train with --eval."
-    return f"Mean PSNR of held-out views {sum(held_out) / len(held_out):.2f} dB over {len(held_out)} scenes."
+    count = f"{len(held_out)} scene{'s' * (len(held_out) != 1)}"
+    return f"Mean PSNR of held-out views {sum(held_out) / len(held_out):.2f} dB over {count}."
 
 
 def _row(record: dict[str, Any], picture: str) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from gsopt.results.evaluation import read_metrics
 RECORDS, PAGE, PICTURE = "scenes.json", "index.html", "picture.webp"
 FIGURES = ("psnr", "ssim", "lpips_alex")
 VERSION = 1
+SPARING = 20.0
+"""Time between two writings of the records, in durations of one."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,20 @@ class Limits:
     threads: int = 1
     memory: int | None = None
     seconds: float = 86_400.0
+
+
+class Sparingly:
+    """Calls a function in at most a twentieth of the time: the records of 10,000 scenes take longer to write than a
+    farm takes for the next one. A run whose record was lost with the driver is evaluated again, not trained."""
+
+    def __init__(self, function: Callable[[], None]) -> None:
+        self._function, self._next = function, 0.0
+
+    def __call__(self) -> None:
+        began = time.monotonic()
+        if began >= self._next:
+            self._function()
+            self._next = began + SPARING * (time.monotonic() - began)
 
 
 def train_scenes(
@@ -44,11 +61,15 @@ def train_scenes(
     names = [scene.name for scene in scenes]
     jobs = [_job(scene, out, limits) for scene in todo.values()]
     _write(out, records, names)
-    for number, outcome in enumerate(farm.run(jobs), 1):
-        scene = todo[outcome.job.name]
-        records[scene.name] = _record(scene, outcome, out)
+    write = Sparingly(lambda: _write(out, records, names))
+    try:
+        for number, outcome in enumerate(farm.run(jobs), 1):
+            scene = todo[outcome.job.name]
+            records[scene.name] = _record(scene, outcome, out)
+            write()
+            report(f"{number}/{len(jobs)} {_line(records[scene.name])}")
+    finally:
         _write(out, records, names)
-        report(f"{number}/{len(jobs)} {_line(records[scene.name])}")
     return [records[name] for name in names]
 
 
