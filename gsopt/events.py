@@ -71,12 +71,12 @@ def create(temporary: Path) -> BinaryIO:
     temporary.unlink(missing_ok=True)
     if os.name == "posix":  # elsewhere one cannot ask for a process without harm
         for other in temporary.parent.glob(f"{glob.escape(temporary.name.rsplit('.', 2)[0])}.*.tmp"):
-            if _writer_is_dead(other):
+            if writer_is_dead(other):
                 other.unlink(missing_ok=True)
     return open(temporary, "xb")
 
 
-def _writer_is_dead(temporary: Path) -> bool:
+def writer_is_dead(temporary: Path) -> bool:
     """True when no process has the number in the name `.NAME.PROCESS.tmp`."""
     number = temporary.name.rsplit(".", 2)[1]
     if not number.isascii() or not number.isdigit() or not 0 < int(number) < 1 << 31:

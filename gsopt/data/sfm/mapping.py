@@ -107,10 +107,10 @@ def run_mapper(project: ColmapProject, mapper: str, graph: ViewGraph) -> list[An
 def adjusted(project: ColmapProject, reconstruction: Any) -> Any:
     """The reconstruction after bundle adjustment; the principal point of a camera of many photos may move."""
     if reconstruction.num_reg_images() >= CENTER_FROM * len(reconstruction.cameras):
-        moved = _bundle_adjusted(project, reconstruction, center=True)
+        moved = bundle_adjusted(project, reconstruction, center=True)
         if all(off_center(camera) <= MAX_OFF_CENTER for camera in moved.cameras.values()):
             return moved
-    return _bundle_adjusted(project, reconstruction, center=False)
+    return bundle_adjusted(project, reconstruction)
 
 
 def off_center(camera: Any) -> float:
@@ -119,13 +119,15 @@ def off_center(camera: Any) -> float:
     return float(max(abs(x - 0.5), abs(y - 0.5)))
 
 
-def _bundle_adjusted(project: ColmapProject, reconstruction: Any, *, center: bool) -> Any:
+def bundle_adjusted(project: ColmapProject, reconstruction: Any, *, center: bool = False, lens: bool = True) -> Any:
+    """A copy after bundle adjustment; `center` moves principal points, `lens` the terms of distortion."""
     pycolmap = project.pycolmap
     reconstruction = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = project.config.focal is None
     options.refine_principal_point = center
+    options.refine_extra_params = lens
     options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
     options.ceres.solver_options.num_threads = 1
     everything = pycolmap.BundleAdjustmentConfig()

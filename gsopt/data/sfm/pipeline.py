@@ -22,7 +22,8 @@ from gsopt._optional import require
 from gsopt._version import __version__
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import read_dataset
-from gsopt.data.sfm import diagnosis, features, known_poses, mapping
+from gsopt.data.sfm import diagnosis, features, few_photos, known_poses, mapping
+from gsopt.data.sfm.child_process import run_in_child
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.mapping import MappingResult
@@ -33,7 +34,7 @@ from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import extract_frames, is_video
-from gsopt.data.sfm.write_scene import write_scene
+from gsopt.data.sfm.write_scene import SCENE, write_scene
 from gsopt.data.working_folder import working_folder
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
@@ -63,15 +64,22 @@ def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lam
         raise InputError(f"{source} does not exist. Give a folder of photos or a video.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
-    pycolmap = require("pycolmap", "sfm", "Finding camera poses")
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # the diagnosis reports what matters
     with working_folder(out) as work:
-        run = _Run(pycolmap, source, work, config, report)
-        scene, found = run.posed()
+        found, seconds = run_in_child(source, work, config, report)
         if out.is_dir():
             out.rmdir()
-        os.replace(scene, out)
-    return PosedScene(out, found, run.seconds)
+        os.replace(work / SCENE, out)
+    return PosedScene(out, found, seconds)
+
+
+def write_posed_scene(
+    source: Path, work: Path, config: SfmConfig, report: Report
+) -> tuple[Diagnosis, dict[str, float]]:
+    """Write WORK/scene; returns its diagnosis and the time by stage."""
+    pycolmap = require("pycolmap", "sfm", "Finding camera poses")
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)  # the diagnosis reports what matters
+    run = _Run(pycolmap, source, work, config, report)
+    return run.posed()[1], run.seconds
 
 
 class _Run:
@@ -93,6 +101,8 @@ class _Run:
         graph, matching = self._graph(project, photos, inputs, frames)
         with self._timed("mapping"):
             mapped = self._mapped(project, graph, frames)
+            if frames is None and self._is_few(photos):
+                graph, mapped = self._few(project, photos, inputs, graph, mapped)
         if mapped is None:
             raise too_few(diagnosis.explain(photos, refused, graph, set()), graph)
         report = self._diagnose(photos, refused, graph, mapped)
@@ -142,6 +152,33 @@ class _Run:
         with self._timed("matching"):
             graph = features.match(project, names, matching, self.report)
         return graph, matching
+
+    def _is_few(self, photos: list[Photo]) -> bool:
+        """True where every photo is dear and nobody has chosen another way."""
+        chosen = (self.config.mapper, self.config.matching) != ("auto", "auto")
+        return mapping.SMALLEST_MODEL <= len(photos) <= few_photos.FEW_UP_TO and not chosen
+
+    def _few(
+        self,
+        project: ColmapProject,
+        photos: list[Photo],
+        inputs: FeatureInput,
+        graph: ViewGraph,
+        mapped: MappingResult | None,
+    ) -> tuple[ViewGraph, MappingResult | None]:
+        """What was found, or what a second look with thorough features finds where that cannot be trusted."""
+        trust = few_photos.trust(project, mapped)
+        placed = len(mapped.names) if mapped is not None else 0
+        if placed == len(photos) and trust >= few_photos.STRONG_OBSERVATIONS:
+            return graph, mapped
+        self.report(f"few photos with little in common: looking thoroughly for features (masks: {inputs.kind})")
+        project = replace(project, database=self.work / "thorough.db")
+        features.extract(project, photos, None, thorough=True)
+        hypotheses = few_photos.match_few(project, inputs.masks, self.report)
+        again, graph_again = few_photos.find_few_poses(project, hypotheses, self.report)
+        if trust >= few_photos.MIN_OBSERVATIONS and placed >= (len(again.names) if again is not None else 0):
+            return graph, mapped
+        return graph_again, again
 
     def _mapped(
         self, project: ColmapProject, graph: ViewGraph, frames: list[PosedImage] | None

@@ -21,6 +21,8 @@ from gsopt.data.sfm.placement import Similarity
 from gsopt.events import to_json, write_atomic
 from gsopt.geometry.cameras import opengl_from_viewmats
 
+SCENE = "scene"
+"""Name of the finished scene inside the working folder."""
 JPEG_QUALITY = 97
 """High: the photos are compared with renderings pixel by pixel."""
 
@@ -30,7 +32,7 @@ def write_scene(
 ) -> Path:
     """Write the scene to WORK/scene and return that folder. `reconstruction` is changed to what was written."""
     reconstruction.transform(pycolmap.Sim3d(similarity.scale, _rotation(pycolmap, similarity), similarity.translation))
-    found, scene = work / "found", work / "scene"
+    found, scene = work / "found", work / SCENE
     _model_folder(reconstruction, found)
     (found / "images").symlink_to(work / "photos")
     if inputs.kind == "folder":

@@ -1,0 +1,124 @@
+"""Poses from few photos alone: which are found, and how far are they from poses made of all photos?
+
+    python experiments/few_photo_poses.py HEAD FOX --arm ARM [--only head-8 ...] [--flags="--features both"]
+
+HEAD is the folder ethiopianHead_800 (66 photos of a museum head on a turntable, with masks; CC BY-NC-SA, not part of
+gsopt), FOX 50 photos of a fox with transforms.json. Of both, well-spread photos are copied into an empty folder (the
+head's with and without their masks) and given to `gsopt sfm`. Found poses are aligned with the published ones by the
+best similarity. ARM names the rows in experiments/results/few_photo_poses.json; rows that are there are not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsopt.benchmark.machine import machine
+from gsopt.data.posed_images import PosedImage
+from gsopt.data.scene import read_dataset
+from gsopt.data.sfm.trajectory import centers, compare
+from gsopt.events import to_json, write_atomic
+from gsopt.geometry.farthest_points import farthest_points
+
+RESULTS = Path(__file__).parent / "results" / "few_photo_poses.json"
+HEAD_COUNTS, FOX_COUNTS = (4, 6, 8, 12), (8,)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("head", type=Path)
+    parser.add_argument("fox", type=Path)
+    parser.add_argument("--arm", required=True)
+    parser.add_argument("--flags", default="", help="more words for `gsopt sfm`")
+    parser.add_argument("--only", nargs="*", default=[], metavar="CASE", help="such as head-8, head-8-masks, fox-8")
+    parser.add_argument("--keep", type=Path, help="folder for the scenes that were found")
+    args = parser.parse_args()
+    cases = {f"head-{count}{kind}": (args.head, count, bool(kind)) for count in HEAD_COUNTS for kind in ("", "-masks")}
+    cases |= {f"fox-{count}": (args.fox, count, False) for count in FOX_COUNTS}
+    for name, (data, count, with_masks) in cases.items():
+        rows = read()
+        if f"{args.arm} {name}" in rows or (args.only and name not in args.only):
+            continue
+        row = measured(data, count, with_masks, shlex.split(args.flags), args.keep and args.keep / name)
+        print(name, json.dumps(row), flush=True)
+        write({**read(), f"{args.arm} {name}": {"flags": args.flags, **row}})
+
+
+def well_spread(data: Path, count: int) -> list[PosedImage]:
+    """The photos that `gsopt train --views` would take of all."""
+    frames = read_dataset(data).frames
+    eyes = torch.from_numpy(centers(viewmats(frames)))
+    return [frames[row] for row in sorted(farthest_points(eyes, count))]
+
+
+def viewmats(frames: list[PosedImage]) -> Any:
+    return np.stack([frame.viewmat.numpy() for frame in frames])
+
+
+def measured(data: Path, count: int, with_masks: bool, flags: list[str], keep: Path | None) -> dict[str, Any]:
+    """One call of `gsopt sfm` on a folder that holds nothing but the photos (and their masks)."""
+    frames = well_spread(data, count)
+    with tempfile.TemporaryDirectory() as temporary:
+        photos, scene = Path(temporary, "photos"), Path(temporary, "scene")
+        copied(frames, photos, with_masks)
+        command = [sys.executable, "-m", "gsopt", "sfm", str(photos), "-o", str(scene), "--threads", "1", *flags]
+        began = time.perf_counter()
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        row: dict[str, Any] = {"photos": count, "seconds": round(time.perf_counter() - began, 1)}
+        if ended.returncode != 0:
+            text = [line for line in ended.stderr.splitlines() if line.strip()]
+            return {**row, "posed": 0, "exit_code": ended.returncode, "report": text}
+        if keep is not None:
+            shutil.copytree(scene, keep, dirs_exist_ok=True)
+        return {**row, **agreement(frames, scene)}
+
+
+def copied(frames: list[PosedImage], photos: Path, with_masks: bool) -> None:
+    photos.mkdir()
+    for frame in frames:
+        shutil.copyfile(frame.path, photos / frame.path.name)
+        if with_masks:
+            (photos / "masks").mkdir(exist_ok=True)
+            mask = frame.path.parents[1] / "masks" / f"{frame.path.stem}.png"
+            shutil.copyfile(mask, photos / "masks" / mask.name)
+
+
+def agreement(frames: list[PosedImage], scene: Path) -> dict[str, Any]:
+    """Found poses against the published ones, after the best similarity."""
+    record = json.loads((scene / "sfm.json").read_text())
+    truth = {frame.path.stem: frame for frame in frames}
+    found = {Path(frame.name).stem: frame for frame in read_dataset(scene).frames}
+    names = sorted(found)
+    row: dict[str, Any] = {
+        "posed": len(names),
+        "without_pose": sorted(truth.keys() - found.keys()),
+        "focal_ratio": round(float(found[names[0]].K[0, 0] / truth[names[0]].K[0, 0]), 4),
+        "points": record["points"],
+        "track_length": round(record["track_length"], 3),
+        "reprojection_error_px": round(record["reprojection_error"], 3),
+    }
+    error = compare(viewmats([found[name] for name in names]), viewmats([truth[name] for name in names]))
+    return {**row, **{key: value for key, value in error.summary().items() if not key.endswith("median")}}
+
+
+def read() -> dict[str, Any]:
+    return dict(json.loads(RESULTS.read_text())["rows"]) if RESULTS.is_file() else {}
+
+
+def write(rows: dict[str, Any]) -> None:
+    write_atomic(RESULTS, to_json({"command": __doc__.split("\n\n")[1].strip(), "machine": machine(), "rows": rows}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,267 @@
+"""Poses from few photos where the ordinary way fails: thorough features, and several starts of which the best is kept.
+
+matches ─► without a background at rest ─► for each focal length: verified pairs ─► mapping from several first pairs
+─► bundle adjustment ─► the reconstruction that explains most. With many photos one start is as good as another; with
+few of them each decision of an incremental mapper counts.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gsopt.data.image_files import IMAGE_FORMATS
+from gsopt.data.sfm.features import ColmapProject, ViewGraph, read_graph
+from gsopt.data.sfm.guided_matches import with_guided_matches
+from gsopt.data.sfm.mapping import (
+    SMALLEST_MODEL,
+    MappingResult,
+    bundle_adjusted,
+    incremental_options,
+    keep_coherent,
+    registered,
+)
+from gsopt.data.sfm.pair_matches import PairMatches, match_features, read_matches, without_background
+from gsopt.events import Report
+
+FEW_UP_TO = 16
+"""Photos up to which the search of this file is worth its time."""
+FOCALS = (1.2, 1.9, 0.75)
+"""Focal lengths tried where EXIF has none, in longer sides of the photo: 45, 30 and 67 degrees. All are adjusted."""
+FIRST_PAIRS = 5
+"""Pairs from which mapping is started, besides COLMAP's own choice."""
+MIN_POSE_INLIERS = 15
+"""Points by which a photo is placed."""
+MIN_INLIERS = 18
+"""Features that two photos must have in common after verification."""
+MAX_ERROR = 3.0
+"""Farthest from the epipolar line, px."""
+MAX_TRIALS = 5000
+ERROR_SCALE = 1.5
+"""Error at which an observation no longer speaks for a reconstruction, px."""
+STRONG_OBSERVATIONS = 150
+"""Points seen by the median photo with which the ordinary reconstruction of few photos is trusted."""
+MIN_OBSERVATIONS = 100
+"""Points seen by the median photo below which poses are no better than a guess: 4 of 8 photos of a museum head with 86
+were turned by 3 to 70 degrees, 10 of 12 with 256 by 1.4."""
+AMPLE_OBSERVATIONS = 400
+"""Points seen by the median photo from which more matches add time and nothing else."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One reconstruction and how it was begun."""
+
+    reconstruction: Any
+    hypothesis: str
+    """Where its features lie."""
+
+    @property
+    def photos(self) -> int:
+        return int(self.reconstruction.num_reg_images())
+
+    @property
+    def support(self) -> float:
+        """Sum over observations of max(0, 1 - (error / ERROR_SCALE)^2), after Torr and Zisserman 2000."""
+        points = self.reconstruction.points3D.values()
+        return sum(point.track.length() * max(0.0, 1 - (point.error / ERROR_SCALE) ** 2) for point in points)
+
+
+def match_few(project: ColmapProject, masks: Path | None, report: Report) -> list[tuple[str, PairMatches]]:
+    """Matches to try in order, each with the words for where they lie."""
+    pairs = match_features(project)
+    moving = without_background(project.pycolmap, pairs, project.config.seed)
+    if moving is not None:
+        report("the background stands still in all photos while the object turns: left out")
+    whole = moving or pairs
+    if masks is None:
+        return [("the whole photos", whole)]
+    return [("the masks", inside(whole, masks)), ("the whole photos", whole)]
+
+
+def inside(pairs: PairMatches, masks: Path) -> PairMatches:
+    """The matches whose two ends lie inside the masks; a photo without a mask counts everywhere."""
+    shows = {number: _shown(pairs, number, masks / f"{name}.png") for number, name in pairs.names.items()}
+    return pairs.kept({(a, b): shows[a][rows[:, 0]] & shows[b][rows[:, 1]] for (a, b), rows in pairs.matches.items()})
+
+
+def _shown(pairs: PairMatches, number: int, mask: Path) -> Any:
+    points = pairs.keypoints[number]
+    if not mask.is_file():
+        return np.ones(len(points), dtype=bool)
+    with Image.open(mask, formats=IMAGE_FORMATS) as image:
+        pixels = np.asarray(image.convert("L"))
+    columns = np.clip(points[:, 0].astype(int), 0, pixels.shape[1] - 1)
+    rows = np.clip(points[:, 1].astype(int), 0, pixels.shape[0] - 1)
+    return pixels[rows, columns] > 127
+
+
+def find_few_poses(
+    project: ColmapProject, hypotheses: list[tuple[str, PairMatches]], report: Report
+) -> tuple[MappingResult | None, ViewGraph]:
+    """The best reconstruction of all starts, or None, and the view graph it was made from."""
+    attempts: list[Attempt] = []
+    count = len(hypotheses[0][1].names)
+    focals = _focals(project)
+    for where, pairs in hypotheses:
+        attempts += _attempts(project, pairs, where, focals)
+        placed = max((attempt.photos for attempt in attempts), default=0)
+        report(f"features of {where} place {placed} of {count} photos")
+        if placed == count:
+            break
+    if not attempts:
+        verify(project, hypotheses[-1][1])
+        return None, read_graph(project)
+    best = max(attempts, key=lambda attempt: attempt.support)
+    pairs = dict(hypotheses)[best.hypothesis]
+    verify(project, pairs, best.reconstruction)
+    graph = read_graph(project)
+    found = best.reconstruction
+    if observations(found) < MIN_OBSERVATIONS:
+        report(f"{best.photos} photos share too few points to be trusted: {observations(found)} in the median photo")
+        return None, graph
+    if observations(found) < AMPLE_OBSERVATIONS:
+        found = with_guided_matches(project, pairs, found)
+    if found.num_reg_images() < count:
+        found = _grown(project, pairs, found)
+    keep_coherent(found)
+    enough = found.num_reg_images() >= SMALLEST_MODEL
+    return (MappingResult(found, "few photos", []) if enough else None), graph
+
+
+def observations(reconstruction: Any) -> int:
+    """Points that the median photo sees."""
+    counts = [reconstruction.image(number).num_points3D for number in reconstruction.reg_image_ids()]
+    return int(np.median(counts)) if counts else 0
+
+
+def trust(project: ColmapProject, mapped: MappingResult | None) -> int:
+    """Points that the median photo of an ordinary reconstruction sees; 0 if it shows a background at rest."""
+    if mapped is None or without_background(project.pycolmap, read_matches(project), project.config.seed) is not None:
+        return 0
+    return observations(mapped.reconstruction)
+
+
+def _grown(project: ColmapProject, pairs: PairMatches, model: Any) -> Any:
+    """The reconstruction with those of the missing photos that its exact points and lens now hold."""
+    missing = pairs.names.keys() - set(model.reg_image_ids())
+    verify(project, pairs, model, only=missing)
+    start = project.database.with_name("start")
+    shutil.rmtree(start, ignore_errors=True)
+    start.mkdir()
+    model.write(start)
+    grown = _mapped(project, None, start)
+    if not grown or grown[0].num_reg_images() <= model.num_reg_images():
+        return model
+    return with_guided_matches(project, pairs, bundle_adjusted(project, grown[0], lens=False))
+
+
+def _attempts(project: ColmapProject, pairs: PairMatches, where: str, focals: list[float | None]) -> Iterator[Attempt]:
+    """The best reconstruction with each focal length, adjusted."""
+    for focal in focals:
+        counts = verify(project, pairs, focal=focal)
+        firsts = [None, *sorted(counts, key=lambda pair: (-counts[pair], pair))[:FIRST_PAIRS]]
+        mapped = [model for first in firsts for model in _mapped(project, first)]
+        if mapped:
+            most = max((Attempt(model, where) for model in mapped), key=lambda attempt: attempt.support)
+            yield Attempt(bundle_adjusted(project, most.reconstruction, lens=False), where)
+
+
+def _focals(project: ColmapProject) -> list[float | None]:
+    """Focal lengths to try; None for those that the database has from EXIF or the user."""
+    with project.opened() as db:
+        known = all(camera.has_prior_focal_length for camera in db.read_all_cameras())
+    return [None] if known else list(FOCALS)
+
+
+def verify(
+    project: ColmapProject,
+    pairs: PairMatches,
+    model: Any | None = None,
+    *,
+    focal: float | None = None,
+    only: set[int] | None = None,
+) -> dict[tuple[int, int], int]:
+    """Puts the geometry of each pair into the database, by lenses of a focal length or of a reconstruction.
+
+    With `only`, what the database has is kept, and pairs with one of these photos are added. Returns the number of
+    features in common by pair, for pairs that have enough.
+    """
+    pycolmap = project.pycolmap
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = project.config.seed
+    options.ransac.max_error = MAX_ERROR
+    options.ransac.max_num_trials = MAX_TRIALS
+    options.ransac.min_inlier_ratio = 0.1
+    options.min_num_inliers = MIN_INLIERS
+    options.compute_relative_pose = True
+    options.detect_watermark = False
+    counts: dict[tuple[int, int], int] = {}
+    with project.opened() as db:
+        if only is None:
+            db.clear_two_view_geometries()
+        lenses = _lenses(project, db, model, focal)
+        cameras = {image.image_id: lenses[image.camera_id] for image in db.read_all_images()}
+        for (a, b), rows in sorted(pairs.matches.items()):
+            if len(rows) < MIN_INLIERS or (only is not None and not only & {a, b}):
+                continue
+            points = pairs.keypoints[a], pairs.keypoints[b]
+            found = pycolmap.estimate_calibrated_two_view_geometry(
+                cameras[a], points[0], cameras[b], points[1], rows, options
+            )
+            if len(found.inlier_matches) >= MIN_INLIERS:
+                db.write_two_view_geometry(a, b, found)
+                counts[a, b] = len(found.inlier_matches)
+    return counts
+
+
+def _lenses(project: ColmapProject, db: Any, model: Any | None, focal: float | None) -> dict[int, Any]:
+    """Cameras by number; those without a known focal length get the given one, and none of them distorts."""
+    lenses = {camera.camera_id: camera for camera in db.read_all_cameras()}
+    for number, camera in lenses.items():
+        if model is not None and number in model.cameras:
+            lenses[number] = model.cameras[number]
+        elif focal is not None:
+            length = focal * max(camera.width, camera.height)
+            guess = project.pycolmap.Camera.create_from_model_id(
+                number, camera.model, length, camera.width, camera.height
+            )
+            guess.has_prior_focal_length = True  # otherwise the mapper replaces it by one from two photos
+            db.update_camera(guess)
+            lenses[number] = guess
+    return lenses
+
+
+def _mapped(project: ColmapProject, first: tuple[int, int] | None, start: Path | str = "") -> list[Any]:
+    """Incremental reconstructions with the lens held, from a first pair or from a reconstruction."""
+    options = incremental_options(project)
+    options.min_num_matches = MIN_INLIERS
+    options.extract_colors = False
+    options.structure_less_registration_fallback = False  # takes minutes, and places wrongly what has few matches
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.triangulation.ignore_two_view_tracks = False
+    mapper = options.mapper
+    mapper.init_min_num_inliers = MIN_INLIERS
+    mapper.init_min_tri_angle = 6.0
+    mapper.abs_pose_min_num_inliers = MIN_POSE_INLIERS
+    mapper.abs_pose_min_inlier_ratio = 0.25
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
+    if first is not None:
+        options.init_image_id1, options.init_image_id2 = first
+    options.multiple_models = False
+    target = project.database.with_name("attempt")
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    project.pycolmap.set_random_seed(project.config.seed)
+    models = project.pycolmap.incremental_mapping(
+        project.database, project.photos, target, options=options, input_path=start
+    )
+    for model in models.values():
+        keep_coherent(model)
+    return [model for _, model in sorted(models.items()) if len(registered(model)) >= SMALLEST_MODEL]

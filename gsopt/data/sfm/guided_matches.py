@@ -1,0 +1,135 @@
+"""More matches once poses are known: near the epipolar line of a feature few others look like its partner.
+
+A photo of the same thing from 40 degrees to the side shares few features that are the best match in the whole photo,
+and many that are the best match on their epipolar line. They make the poses of few photos exact.
+"""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm.mapping import bundle_adjusted, incremental_options
+from gsopt.data.sfm.pair_matches import PairMatches
+
+BANDS = (0.006,)
+"""Distance from the epipolar line in which partners are looked for, round by round, a share of the diagonal."""
+MAX_TURN_DEGREES = 60.0
+"""Photos whose directions differ more show other sides."""
+RATIO = 0.85
+MAX_DISTANCE = 0.75
+"""Farthest two descriptors may be apart, of unit length."""
+
+
+def with_guided_matches(project: ColmapProject, pairs: PairMatches, model: Any) -> Any:
+    """The reconstruction after rounds of matching along epipolar lines, triangulation and adjustment."""
+    descriptors = _descriptors(project, pairs)
+    for band in BANDS:
+        _write_guided(project, pairs, model, descriptors, band)
+        target = project.database.with_name("guided")
+        shutil.rmtree(target, ignore_errors=True)
+        target.mkdir()
+        options = incremental_options(project)
+        options.triangulation.ignore_two_view_tracks = False
+        bare = copy.deepcopy(model)
+        bare.delete_all_points2D_and_points3D()
+        model = project.pycolmap.triangulate_points(
+            bare, project.database, project.photos, target, options=options, refine_intrinsics=False
+        )
+        model = bundle_adjusted(project, model, lens=False)
+    return model
+
+
+def _descriptors(project: ColmapProject, pairs: PairMatches) -> dict[int, Float[np.ndarray, "F 128"]]:
+    """Unit descriptors by photo."""
+    found = {}
+    with project.opened() as db:
+        for number in pairs.names:
+            rows = db.read_descriptors(number).data.astype(np.float32)
+            found[number] = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+    return found
+
+
+def _write_guided(project: ColmapProject, pairs: PairMatches, model: Any, descriptors: Any, band: float) -> None:
+    """Puts the guided matches of all pairs of placed photos into the database, as verified ones."""
+    pycolmap = project.pycolmap
+    placed = sorted(model.reg_image_ids())
+    with project.opened() as db:
+        db.clear_two_view_geometries()
+        for i, a in enumerate(placed):
+            for b in placed[i + 1 :]:
+                first, second = model.image(a), model.image(b)
+                relative = second.cam_from_world() * first.cam_from_world().inverse()
+                if np.degrees(relative.rotation.angle()) > MAX_TURN_DEGREES:
+                    continue
+                fundamental = fundamental_matrix(
+                    relative, model.camera(first.camera_id), model.camera(second.camera_id)
+                )
+                points = pairs.keypoints[a][: len(descriptors[a])], pairs.keypoints[b][: len(descriptors[b])]
+                limit = band * float(np.hypot(*pairs.sizes[a]))
+                rows = guided(fundamental, *points, descriptors[a], descriptors[b], limit)
+                rows = _with_verified(rows, pairs, (a, b), fundamental, limit)
+                if len(rows) == 0:
+                    continue
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.cam2_from_cam1 = relative
+                geometry.E = pycolmap.essential_matrix_from_pose(relative)
+                geometry.inlier_matches = rows
+                db.write_two_view_geometry(a, b, geometry)
+
+
+def _with_verified(
+    rows: UInt32[np.ndarray, "M 2"], pairs: PairMatches, pair: tuple[int, int], fundamental: Any, limit: float
+) -> UInt32[np.ndarray, "N 2"]:
+    """Guided matches, and the earlier ones that agree with the poses."""
+    earlier = pairs.matches.get(pair)
+    if earlier is None or len(earlier) == 0:
+        return rows
+    first, second = pairs.points(pair)
+    lines = _homogeneous(first) @ fundamental.T
+    distance = np.abs((lines * _homogeneous(second)).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    agreeing = earlier[distance < limit]
+    new = ~(np.isin(rows[:, 0], agreeing[:, 0]) | np.isin(rows[:, 1], agreeing[:, 1]))
+    return np.concatenate([agreeing, rows[new]]).astype(np.uint32)
+
+
+def fundamental_matrix(relative: Any, first: Any, second: Any) -> Float[np.ndarray, "3 3"]:
+    """F with second^T F first = 0 for pixels of two pinhole cameras (Hartley and Zisserman 2004, eq. 9.11)."""
+    x, y, z = relative.translation
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    essential = cross @ relative.rotation.matrix()
+    return np.linalg.inv(second.calibration_matrix()).T @ essential @ np.linalg.inv(first.calibration_matrix())
+
+
+def guided(
+    fundamental: Float[np.ndarray, "3 3"],
+    first: Float[np.ndarray, "F 2"],
+    second: Float[np.ndarray, "G 2"],
+    a: Float[np.ndarray, "F 128"],
+    b: Float[np.ndarray, "G 128"],
+    limit: float,
+) -> UInt32[np.ndarray, "M 2"]:
+    """Mutual best matches within `limit` px of the epipolar line that are clearly better than the next best there."""
+    lines = (_homogeneous(first) @ fundamental.T).astype(np.float32)
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    far = np.abs(lines @ _homogeneous(second).T.astype(np.float32)) > limit
+    likeness = a @ b.T
+    likeness[far] = -1.0
+    best = likeness.argmax(axis=1)
+    rows = np.arange(len(a))
+    top = likeness[rows, best]
+    mutual = likeness.argmax(axis=0)[best] == rows
+    likeness[rows, best] = -1.0
+    distance, next_best = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, likeness.max(axis=1)))
+    keep = mutual & (top > 0) & (distance < MAX_DISTANCE) & (distance < RATIO * next_best)
+    return np.stack([rows[keep], best[keep]], axis=1).astype(np.uint32)
+
+
+def _homogeneous(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+    return np.column_stack([points, np.ones(len(points))])

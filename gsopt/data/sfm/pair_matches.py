@@ -1,0 +1,121 @@
+"""Matches of few photos in memory, where they can be tested and filtered before COLMAP maps them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt32
+
+from gsopt.data.sfm.features import ColmapProject
+
+MAX_RATIO = 0.85
+"""Distance to the best match as a share of that to the second best: looser than Lowe's 0.8, as more is checked later."""
+BACKGROUND_SHARE = 0.8
+"""Share of the pairs that must show a background at rest before it is taken out."""
+BACKGROUND_MATCHES = 12
+BACKGROUND_SPAN = 0.5
+"""Share of the picture, across and down, that a background at rest must cover."""
+BACKGROUND_SHIFT = 0.15
+"""Farthest a picture's corner moves with a background at rest, as a share of the diagonal."""
+BACKGROUND_ERROR = 0.012
+"""Distance from the background's homography, as a share of the diagonal: things before the wall move a little more."""
+
+ImagePair = tuple[int, int]
+Points = Float[np.ndarray, "F 2"]
+Matches = UInt32[np.ndarray, "M 2"]
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Keypoints of each photo and matches of each pair, by the numbers of the database."""
+
+    names: dict[int, str]
+    sizes: dict[int, tuple[int, int]]
+    keypoints: dict[int, Points]
+    matches: dict[ImagePair, Matches]
+
+    def points(self, pair: ImagePair) -> tuple[Points, Points]:
+        """Positions of the matches of a pair in both photos, px."""
+        rows = self.matches[pair]
+        return self.keypoints[pair[0]][rows[:, 0]], self.keypoints[pair[1]][rows[:, 1]]
+
+    def kept(self, keep: Mapping[ImagePair, Bool[np.ndarray, "M"]]) -> PairMatches:
+        """The same with some of the matches."""
+        chosen = {pair: rows[keep[pair]] if pair in keep else rows for pair, rows in self.matches.items()}
+        return replace(self, matches=chosen)
+
+
+def match_features(project: ColmapProject) -> PairMatches:
+    """Compares all photos with all by their features alone; no geometry yet."""
+    pycolmap = project.pycolmap
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = project.config.threads or -1
+    options.skip_geometric_verification = True
+    options.sift.max_ratio = MAX_RATIO
+    with project.opened() as db:
+        names = [image.name for image in db.read_all_images()]
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = project.database.with_name("pairs.txt")
+    pairing.match_list_path.write_text(
+        "".join(f"{a} {b}\n" for a, b in itertools.combinations(names, 2)), encoding="utf-8"
+    )
+    pycolmap.match_image_pairs(project.database, matching_options=options, pairing_options=pairing)
+    return read_matches(project)
+
+
+def read_matches(project: ColmapProject) -> PairMatches:
+    """The matches in a database, verified or not."""
+    with project.opened() as db:
+        images = {image.image_id: image for image in db.read_all_images()}
+        names = {number: image.name for number, image in sorted(images.items())}
+        cameras = {camera.camera_id: (camera.width, camera.height) for camera in db.read_all_cameras()}
+        sizes = {number: cameras[images[number].camera_id] for number in names}
+        keypoints = {number: db.read_keypoints(number)[:, :2].astype(np.float64) for number in names}
+        matches = {
+            pair: db.read_matches(*pair) for pair in itertools.combinations(names, 2) if db.exists_matches(*pair)
+        }
+    return PairMatches(names, sizes, keypoints, matches)
+
+
+def without_background(pycolmap: Any, pairs: PairMatches, seed: int) -> PairMatches | None:
+    """The matches that move, if behind them a background stands still in the picture; None if it does not.
+
+    That is an object on a turntable before a fixed camera. The background is most of what matches there, fits a camera
+    that never moved, and would be reconstructed in place of the object. A homography close to the identity explains it
+    in every pair of photos, also in pairs from opposite sides; a camera that walks around sees no such thing.
+    """
+    compared = [pair for pair, rows in pairs.matches.items() if len(rows) >= BACKGROUND_MATCHES]
+    still = {pair: _at_rest(pycolmap, *pairs.points(pair), pairs.sizes[pair[0]], seed) for pair in compared}
+    found = {pair: ~rows for pair, rows in still.items() if rows.any()}
+    if len(found) < 3 or len(found) < BACKGROUND_SHARE * len(compared):
+        return None
+    return pairs.kept(found)
+
+
+def _at_rest(pycolmap: Any, first: Points, second: Points, size: tuple[int, int], seed: int) -> Bool[np.ndarray, "M"]:
+    """Marks the matches that lie on a wide background at rest."""
+    width, height = size
+    diagonal = float(np.hypot(width, height))
+    marks = np.zeros(len(first), dtype=bool)
+    near = np.flatnonzero(np.linalg.norm(second - first, axis=1) < BACKGROUND_SHIFT * diagonal)
+    if len(near) < BACKGROUND_MATCHES:
+        return marks
+    options = pycolmap.RANSACOptions()
+    options.max_error = BACKGROUND_ERROR * diagonal
+    options.random_seed = seed
+    options.max_num_trials = 3000
+    found = pycolmap.estimate_homography_matrix(first[near], second[near], options)
+    if found is None or found["num_inliers"] < BACKGROUND_MATCHES:
+        return marks
+    corners = np.array([[0.0, 0.0, 1.0], [width, 0.0, 1.0], [width, height, 1.0], [0.0, height, 1.0]])
+    moved = corners @ np.asarray(found["H"]).T
+    shift = np.linalg.norm(moved[:, :2] / moved[:, 2:] - corners[:, :2], axis=1).max() / diagonal
+    rows = near[np.asarray(found["inlier_mask"], dtype=bool)]
+    span = np.ptp(first[rows], axis=0) / (width, height)
+    if shift < BACKGROUND_SHIFT and span.min() > BACKGROUND_SPAN:
+        marks[rows] = True
+    return marks
