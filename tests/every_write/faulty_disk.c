@@ -1,6 +1,6 @@
 // Fails the k-th change of a folder. Preloaded, it counts every call that creates, writes, flushes, renames or removes
-// something below `root`, by whatever language, and at call `at` it does what `kind` says. Calls of all threads count; children
-// of the armed process do not.
+// something below `root`, by whatever language, and at call `at` it does what `kind` says. Calls of all threads count, and those
+// of programs that the armed process starts: FAULTS_FILE holds the count that they share, FAULTS_ARM is KIND:ERRNO:AT:FOLDER.
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -18,21 +18,20 @@
 
 enum { NONE, KILL, FAIL_ONCE, FAIL_FROM_HERE, SHORT };
 
-// Shared with the process that forks the armed one: it reads the count after a kill.
+// Shared with the process that forks the armed one, which reads the count after a kill, and with programs it starts.
 static struct { long calls; int happened; } *shared;
 static char root[PATH_MAX];
 static size_t root_length;
 static int kind, failure;
 static long at;
 
-__attribute__((constructor)) static void share(void) {
-  shared = mmap(NULL, sizeof *shared, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
-}
-
-void faults_arm(const char* folder, int what, int error, long call) {
+static void arm(const char* folder, int what, int error, long call) {
   snprintf(root, sizeof root, "%s/", folder);
   root_length = strlen(root);
   kind = what, failure = error, at = call;
+}
+void faults_arm(const char* folder, int what, int error, long call) {
+  arm(folder, what, error, call);
   shared->calls = 0, shared->happened = 0;
 }
 long faults_calls(void) { return shared->calls; }
@@ -145,4 +144,13 @@ ssize_t sendfile(int to, int from, off_t* offset, size_t size) {
 ssize_t copy_file_range(int from, off64_t* a, int to, off64_t* b, size_t size, unsigned flags) {
   REAL(copy_file_range);
   return open_below(to) && counted(1) ? -1 : real(from, a, to, b, size, flags);
+}
+
+__attribute__((constructor)) static void share(void) {
+  const char *path = getenv("FAULTS_FILE"), *armed = getenv("FAULTS_ARM");
+  int file = path ? open(path, O_RDWR) : -1, what, error, length = 0;
+  long call;
+  if (file < 0) abort();
+  shared = mmap(NULL, sizeof *shared, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+  if (armed && sscanf(armed, "%d:%d:%ld:%n", &what, &error, &call, &length) == 3) arm(armed + length, what, error, call);
 }

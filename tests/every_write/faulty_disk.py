@@ -76,6 +76,8 @@ def faulty_disk(folder: Path) -> Iterator[FaultyDisk]:
     command = [str(compiler()), "-O1", "-Wall", "-Werror", "-shared", "-fPIC", str(HERE / "faulty_disk.c"), "-ldl"]
     subprocess.run([*command, "-o", str(library)], check=True)
     worker = [sys.executable, str(HERE / "worker.py")]
-    env = {**os.environ, "LD_PRELOAD": str(library)}
+    count = folder / "count"
+    count.write_bytes(bytes(64))
+    env = {**os.environ, "LD_PRELOAD": str(library), "FAULTS_FILE": str(count)}
     with subprocess.Popen(worker, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env, text=True) as process:
         yield FaultyDisk(process, folder / "log")

@@ -31,6 +31,7 @@ def run(job: dict[str, Any], faults: ctypes.CDLL) -> NoReturn:
     os.dup2(log, 2)
     signal.alarm(LONGEST_SECONDS)
     folder, kind = os.fsencode(job["folder"]), KINDS.index(job["kind"])
+    os.environ["FAULTS_ARM"] = f"{kind}:{job['errno']}:{job['at']}:{job['folder']}"  # for programs that it starts
     faults.faults_arm(folder, kind, job["errno"], ctypes.c_long(job["at"]))
     os._exit(main(job["arguments"]))
 

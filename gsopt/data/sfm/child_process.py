@@ -1,8 +1,8 @@
 """Structure from motion in a process of its own, because COLMAP ends its process where it finds the disk full.
 
-The child gets one JSON line on stdin (what to do) and answers with JSON lines on stdout: lines of progress, and at last
-the diagnosis or an error. Its other output goes to a file that only a crash makes of interest. It ends when stdin is
-closed, so that it never outlives a killed parent.
+The child is given what to do as JSON and answers with JSON lines on stdout: lines of progress, and at last the
+diagnosis or an error. Its other output goes to a file in the working folder. It ends when its stdin is closed, so that it never
+outlives a killed parent.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ LOG = "colmap.log"
 def run_in_child(source: Path, work: Path, config: SfmConfig, report: Report) -> tuple[Diagnosis, dict[str, float]]:
     """Writes WORK/scene in a child process. Raises the child's error, or InputError when the child crashed."""
     package = str(Path(__file__).parents[3])
+    job = json.dumps({"source": str(source), "work": str(work), "config": asdict(config)})
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
     with (
         (work / LOG).open("wb") as log,
         subprocess.Popen(
-            [sys.executable, "-m", __name__],
+            [sys.executable, "-m", __name__, job],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
@@ -44,20 +45,15 @@ def run_in_child(source: Path, work: Path, config: SfmConfig, report: Report) ->
         ) as child,
     ):
         try:
-            return _answer(child, {"source": str(source), "work": str(work), "config": asdict(config)}, report)
+            return _answer(child, work, report)
         finally:
             child.kill()
 
 
-def _answer(child: subprocess.Popen[str], job: dict[str, Any], report: Report) -> tuple[Diagnosis, dict[str, float]]:
-    assert child.stdin is not None
+def _answer(child: subprocess.Popen[str], work: Path, report: Report) -> tuple[Diagnosis, dict[str, float]]:
+    """The child's last answer, after its lines."""
     assert child.stdout is not None
     stage = "started"
-    try:
-        child.stdin.write(json.dumps(job) + "\n")
-        child.stdin.flush()
-    except BrokenPipeError:
-        pass  # it crashed at once; what follows tells how
     for line in child.stdout:
         message = json.loads(line) if line.endswith("\n") else {}
         if "line" in message:
@@ -69,7 +65,7 @@ def _answer(child: subprocess.Popen[str], job: dict[str, Any], report: Report) -
             found = message["diagnosis"]
             found["left"] = [UnplacedPhoto(**photo) for photo in found["left"]]
             return Diagnosis(**found), message["seconds"]
-    raise _crash(child.wait(), Path(job["work"]), stage)
+    raise _crash(child.wait(), work, stage)
 
 
 def _error(message: dict[str, Any]) -> Exception:
@@ -94,7 +90,7 @@ def main() -> None:
     """The child: read the job, do it, answer."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # COLMAP writes to stdout where it likes
-    job = json.loads(sys.stdin.readline())
+    job = json.loads(sys.argv[1])
     threading.Thread(target=_end_with, args=(sys.stdin,), daemon=True).start()
     _say(answers, _done(job, lambda line: _say(answers, {"line": line})))
     os._exit(0)  # COLMAP's threads need not be waited for

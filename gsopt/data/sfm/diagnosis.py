@@ -40,6 +40,11 @@ REMEDIES = {
     "weak": "Take more photos between those that match weakly, each sharing two thirds of its picture with the next.",
 }
 
+TURNTABLE = (
+    "The background stands still in all photos: the object was turned, not the camera, and only what turns was used. "
+    "Turn it by 20 degrees between photos, on a patterned cloth that turns with it."
+)
+
 
 @dataclass(frozen=True)
 class UnplacedPhoto:
@@ -101,6 +106,11 @@ def explain(
             left.append(UnplacedPhoto(photo.name, kind, REASONS[kind], detail))
     names = [photo.name for photo in photos if photo.name in registered]
     diagnosis = Diagnosis(len(photos) + len(refused), names, left)
+    diagnosis.advice += [
+        f"{photo.name} is placed but blurred: the splats learn its blur. Take it again, or leave it out."
+        for photo in photos
+        if photo.name in registered and is_blurred(photo, usual)
+    ]
     diagnosis.advice += gaps([photo.name for photo in photos], registered)
     kinds = {item.kind for item in left}
     diagnosis.advice += [text for kind, text in REMEDIES.items() if kind in kinds]
@@ -113,11 +123,7 @@ def why_unplaced(photo: Photo, graph: ViewGraph | None, registered: set[str], us
         return "alone", ""
     features, partners = graph.features.get(photo.name, 0), graph.partners(photo.name)
     few = features < FEW_FEATURES
-    if (
-        photo.sharpness < BLURRED_SHARE * usual
-        and photo.contrast > PLAIN_CONTRAST
-        and (few or sum(partners.values()) < MIN_COMMON_FEATURES)
-    ):
+    if is_blurred(photo, usual) and (few or sum(partners.values()) < MIN_COMMON_FEATURES):
         return "blurred", f"sharpness {photo.sharpness:.3f}, usual is {usual:.3f}"
     if few:
         return "featureless", f"{features} features"
@@ -132,6 +138,11 @@ def why_unplaced(photo: Photo, graph: ViewGraph | None, registered: set[str], us
     known = {name: count for name, count in partners.items() if name in registered} or partners
     name, count = next(iter(known.items()))
     return "weak", f"best: {count} features in common with {name}"
+
+
+def is_blurred(photo: Photo, usual: float) -> bool:
+    """True for a photo much less sharp than is usual in its set, which is not plain."""
+    return photo.sharpness < BLURRED_SHARE * usual and photo.contrast > PLAIN_CONTRAST
 
 
 def gaps(names: Sequence[str], registered: set[str]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,13 +147,17 @@ def match(project: ColmapProject, names: Sequence[str], matching: str, report: R
     verification.ransac.random_seed = config.seed
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = database.with_name("pairs.txt")
+    began = time.monotonic()
     for start in range(0, len(pairs), _PAIRS_PER_BATCH):
         part = pairs[start : start + _PAIRS_PER_BATCH]
         pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in part), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, matching_options=options, pairing_options=pairing, verification_options=verification
         )
-        report(f"compared {start + len(part):,} of {len(pairs):,} pairs of photos ({matching})")
+        done = start + len(part)
+        minutes = (time.monotonic() - began) / 60 * (len(pairs) / done - 1)
+        left = f", about {minutes:.0f} min left" if minutes >= 1 else ""
+        report(f"compared {done:,} of {len(pairs):,} pairs of photos ({matching}){left}")
     return read_graph(project)
 
 

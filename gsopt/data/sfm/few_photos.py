@@ -73,16 +73,22 @@ class Attempt:
         return sum(point.track.length() * max(0.0, 1 - (point.error / ERROR_SCALE) ** 2) for point in points)
 
 
-def match_few(project: ColmapProject, masks: Path | None, report: Report) -> list[tuple[str, PairMatches]]:
+@dataclass(frozen=True)
+class Hypotheses:
     """Matches to try in order, each with the words for where they lie."""
+
+    matches: list[tuple[str, PairMatches]]
+    turntable: bool
+    """True when a background at rest was left out."""
+
+
+def match_few(project: ColmapProject, masks: Path | None) -> Hypotheses:
+    """Matches inside the masks, if there are any, and in the whole photos; without a background at rest."""
     pairs = match_features(project)
     moving = without_background(project.pycolmap, pairs, project.config.seed)
-    if moving is not None:
-        report("the background stands still in all photos while the object turns: left out")
-    whole = moving or pairs
-    if masks is None:
-        return [("the whole photos", whole)]
-    return [("the masks", inside(whole, masks)), ("the whole photos", whole)]
+    whole = [("the whole photos", moving or pairs)]
+    masked = [] if masks is None else [("the masks", inside(moving or pairs, masks))]
+    return Hypotheses(masked + whole, moving is not None)
 
 
 def inside(pairs: PairMatches, masks: Path) -> PairMatches:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt32
 from gsopt.data.sfm.features import ColmapProject
 
 MAX_RATIO = 0.85
-"""Distance to the best match as a share of that to the second best: looser than Lowe's 0.8, as more is checked later."""
+"""Distance to the best match as a share of that to the second best: Lowe's 0.8 is strict, and more is checked."""
 BACKGROUND_SHARE = 0.8
 """Share of the pairs that must show a background at rest before it is taken out."""
 BACKGROUND_MATCHES = 12

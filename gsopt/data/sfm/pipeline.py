@@ -88,6 +88,7 @@ class _Run:
     def __init__(self, pycolmap: ModuleType, source: Path, work: Path, config: SfmConfig, report: Report) -> None:
         self.pycolmap, self.source, self.work, self.config, self.report = pycolmap, source, work, config, report
         self.seconds: dict[str, float] = {}
+        self.notes: list[str] = []
 
     def posed(self) -> tuple[Path, Diagnosis]:
         """The finished scene folder inside the working folder, and its diagnosis."""
@@ -104,7 +105,9 @@ class _Run:
             if frames is None and self._is_few(photos):
                 graph, mapped = self._few(project, photos, inputs, graph, mapped)
         if mapped is None:
-            raise too_few(diagnosis.explain(photos, refused, graph, set()), graph)
+            report = diagnosis.explain(photos, refused, graph, set())
+            report.advice += self.notes
+            raise too_few(report, graph)
         report = self._diagnose(photos, refused, graph, mapped)
         with self._timed("writing"):
             scene = self._write(report, mapped, inputs, matching, similarity=self._placed(mapped, frames))
@@ -174,10 +177,11 @@ class _Run:
         self.report(f"few photos with little in common: looking thoroughly for features (masks: {inputs.kind})")
         project = replace(project, database=self.work / "thorough.db")
         features.extract(project, photos, None, thorough=True)
-        hypotheses = few_photos.match_few(project, inputs.masks, self.report)
-        again, graph_again = few_photos.find_few_poses(project, hypotheses, self.report)
+        hypotheses = few_photos.match_few(project, inputs.masks)
+        again, graph_again = few_photos.find_few_poses(project, hypotheses.matches, self.report)
         if trust >= few_photos.MIN_OBSERVATIONS and placed >= (len(again.names) if again is not None else 0):
             return graph, mapped
+        self.notes += [diagnosis.TURNTABLE] if hypotheses.turntable else []
         return graph_again, again
 
     def _mapped(
@@ -198,7 +202,7 @@ class _Run:
         report.reprojection_error = mapped.reconstruction.compute_mean_reprojection_error()
         report.track_length = mapped.reconstruction.compute_mean_track_length()
         report.points = mapped.reconstruction.num_points3D()
-        report.advice += diagnosis.split_groups(graph, mapped.names)
+        report.advice += self.notes + diagnosis.split_groups(graph, mapped.names)
         names, viewmats = poses(mapped.reconstruction)
         report.advice += diagnosis.wide_gaps(names, viewmats)
         return report

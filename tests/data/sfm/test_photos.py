@@ -142,3 +142,12 @@ def test_masks_are_asked_for_and_missed_with_words(folder: Path, tmp_path: Path)
     (tmp_path / "d").mkdir()
     with pytest.raises(InputError, match="has a mask for none of the 3 photos"):
         prepare_masks(str(tmp_path / "empty"), folder, read, tmp_path / "d")
+
+
+def test_a_photo_of_50_megapixels_is_read(tmp_path: Path) -> None:
+    tmp_path.joinpath("photos").mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (362, 543, 3), dtype=np.uint8)
+    Image.fromarray(noise).resize((8688, 5792)).save(tmp_path / "photos" / "large.jpg", quality=60)
+    found, refused = photos.read_photos(photos.find_photos(tmp_path / "photos"), tmp_path / "work")
+    assert refused == []
+    assert (found[0].width, found[0].height) == (8688, 5792)

@@ -1,0 +1,61 @@
+"""COLMAP in a process of its own: crashes, errors, and what killed runs leave behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import textured_room as room
+
+pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
+
+from gsopt.data.sfm import child_process
+from gsopt.data.sfm.pipeline import pose_photos
+from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.working_folder import working_folder
+from gsopt.errors import InputError
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    room.photograph(tmp_path / "photos", room.arc(3))
+    return tmp_path / "photos"
+
+
+@pytest.mark.parametrize(
+    ("words", "name"), [("kill -ABRT $$", "SIGABRT"), ("kill -KILL $$", "SIGKILL"), ("exit 7", "exit code 7")]
+)
+def test_a_crash_is_an_error_that_names_it_and_leaves_nothing(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, name: str
+) -> None:
+    program = tmp_path / "crashing"
+    program.write_text(f"#!/bin/sh\n{words}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(child_process.sys, "executable", str(program))
+    with pytest.raises(InputError, match=rf"COLMAP crashed \({name}\).*MB are free"):
+        pose_photos(photos, tmp_path / "scene", SfmConfig())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["crashing", "photos"]
+
+
+def test_a_refusal_of_the_child_is_the_error_of_the_parent(tmp_path: Path) -> None:
+    room.photograph(tmp_path / "photos", room.arc(1))
+    with pytest.raises(InputError, match="One photo alone has no parallax"):
+        pose_photos(tmp_path / "photos", tmp_path / "scene", SfmConfig())
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_what_a_killed_run_left_is_removed_and_that_of_a_living_one_is_kept(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    dead, living, other = (
+        tmp_path / name for name in (f".scene.{ended.pid}.tmp", f".scene.{os.getppid()}.tmp", ".scene.x.tmp")
+    )
+    for folder in (dead, living, other):
+        (folder / "photos").mkdir(parents=True)
+    with working_folder(tmp_path / "scene"):
+        assert not dead.exists()
+    assert living.exists()
+    assert other.exists()
