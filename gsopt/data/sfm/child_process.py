@@ -1,8 +1,8 @@
 """Structure from motion in a process of its own, because COLMAP ends its process where it finds the disk full.
 
 The child is given what to do as JSON and answers with JSON lines on stdout: lines of progress, and at last the
-diagnosis or an error. Its other output goes to a file in the working folder. It ends when its stdin is closed, so that it never
-outlives a killed parent.
+diagnosis or an error. Its other output goes to a file in the working folder. It ends when its stdin is closed, so that
+it never outlives a killed parent.
 """
 
 from __future__ import annotations

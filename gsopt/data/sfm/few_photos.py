@@ -60,7 +60,7 @@ class Attempt:
 
     reconstruction: Any
     hypothesis: str
-    """Where its features lie."""
+    """The words for where its features lie."""
 
     @property
     def photos(self) -> int:
@@ -180,7 +180,7 @@ def _attempts(project: ColmapProject, pairs: PairMatches, where: str, focals: li
 
 
 def _focals(project: ColmapProject) -> list[float | None]:
-    """Focal lengths to try; None for those that the database has from EXIF or the user."""
+    """Focal lengths to try: one None if the database has them from EXIF or the user."""
     with project.opened() as db:
         known = all(camera.has_prior_focal_length for camera in db.read_all_cameras())
     return [None] if known else list(FOCALS)

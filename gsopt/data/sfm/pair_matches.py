@@ -82,11 +82,11 @@ def read_matches(project: ColmapProject) -> PairMatches:
 
 
 def without_background(pycolmap: Any, pairs: PairMatches, seed: int) -> PairMatches | None:
-    """The matches that move, if behind them a background stands still in the picture; None if it does not.
+    """The matches that move, or None if behind them no background stands still in the picture.
 
-    That is an object on a turntable before a fixed camera. The background is most of what matches there, fits a camera
-    that never moved, and would be reconstructed in place of the object. A homography close to the identity explains it
-    in every pair of photos, also in pairs from opposite sides; a camera that walks around sees no such thing.
+    An object on a turntable before a fixed camera has such a background. It is most of what matches there, fits a
+    camera that never moved, and would be reconstructed in place of the object. A homography close to the identity
+    explains it in every pair of photos, also from opposite sides; a camera that walks around sees no such thing.
     """
     compared = [pair for pair, rows in pairs.matches.items() if len(rows) >= BACKGROUND_MATCHES]
     still = {pair: _at_rest(pycolmap, *pairs.points(pair), pairs.sizes[pair[0]], seed) for pair in compared}

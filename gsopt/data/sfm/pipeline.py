@@ -169,7 +169,7 @@ class _Run:
         graph: ViewGraph,
         mapped: MappingResult | None,
     ) -> tuple[ViewGraph, MappingResult | None]:
-        """What was found, or what a second look with thorough features finds where that cannot be trusted."""
+        """Look a second time, with thorough features, where what was found cannot be trusted; returns the better."""
         trust = few_photos.trust(project, mapped)
         placed = len(mapped.names) if mapped is not None else 0
         if placed == len(photos) and trust >= few_photos.STRONG_OBSERVATIONS:
