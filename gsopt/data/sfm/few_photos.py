@@ -196,7 +196,7 @@ def verify(
 ) -> dict[tuple[int, int], int]:
     """Puts the geometry of each pair into the database, by lenses of a focal length or of a reconstruction.
 
-    With `only`, what the database has is kept, and pairs with one of these photos are added. Returns the number of
+    With `only`, what the database has is kept, save for pairs with one of these photos. Returns the number of
     features in common by pair, for pairs that have enough.
     """
     pycolmap = project.pycolmap
@@ -221,6 +221,8 @@ def verify(
             found = pycolmap.estimate_calibrated_two_view_geometry(
                 cameras[a], points[0], cameras[b], points[1], rows, options
             )
+            if db.exists_two_view_geometry(a, b):
+                db.delete_two_view_geometry(a, b)
             if len(found.inlier_matches) >= MIN_INLIERS:
                 db.write_two_view_geometry(a, b, found)
                 counts[a, b] = len(found.inlier_matches)
