@@ -11,7 +11,19 @@ from gsopt.data.sfm.settings import SfmConfig
 
 HOWTO = Path(__file__).parents[3] / "docs/howto/photos.md"
 SOURCES = Path(sfm.__file__).parent
-OTHER_VERBS = {"--refine-poses", "--lambda-sds", "--threads", "--out", "--seed", "--model", "--mask-model"}
+OTHER_VERBS = {
+    "--refine-poses",
+    "--lambda-sds",
+    "--threads",
+    "--out",
+    "--seed",
+    "--model",
+    "--mask-model",
+    "--exposure",
+    "--depth",
+    "--depth-kind",
+    "--loss",
+}
 
 
 def said() -> str:
