@@ -25,6 +25,9 @@ COARSENING = 3
 """Voxels joined along each axis."""
 MAX_UNCOVERED = 0.05
 """A candidate may leave this share of the silhouettes unexplained: its direction is 3 degrees off."""
+COARSEST, HOPELESS = 6, 0.1
+"""Voxels joined along each axis for a first look, and the share that a plane leaves unexplained there, give or take a
+voxel twice as large, when it is not looked at again."""
 CANDIDATE_ANGLE = 20.0
 """Least angle between the normals of two candidates, degrees."""
 MAX_CANDIDATES = 6
@@ -62,6 +65,10 @@ def candidates(
     middle = (normals * ball.center).sum(1)
     offsets = (middle[:, None] + shifts).flatten()
     normals = normals.repeat_interleave(OFFSETS, 0)
+    rows = torch.nonzero(uncovered(joined(grid, COARSEST), photos, normals, offsets) <= HOPELESS)[:, 0]
+    if len(rows) == 0:
+        return []
+    normals, offsets = normals[rows], offsets[rows]
     lost = uncovered(joined(grid, COARSENING), photos, normals, offsets)
     found: list[Mirror] = []
     for row in lost.argsort(stable=True).tolist():

@@ -9,9 +9,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
+from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, View
 from gsopt.errors import InputError, NumericalError
@@ -29,15 +31,15 @@ from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.estimate import estimate, memory_limit
 from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.finite import require_finite, require_finite_loss
-from gsopt.training.guided.session import RunGuidance
-from gsopt.training.guided.start import start_guidance
+from gsopt.training.guided.choice import recorded_choice
 from gsopt.training.interrupt import StopRequest
-from gsopt.training.library_body import with_library_body
 from gsopt.training.mirror_images import with_recorded_mirrors
 from gsopt.training.plan import RunPlan, guesses, matches_photos
 from gsopt.training.run_directory import Listener, RunDirectory, opened
-from gsopt.training.shape_prior_body import with_shape_prior_body
 from gsopt.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from gsopt.training.guided.session import RunGuidance
 
 PROGRESS_SECONDS = 0.5
 # Steps between two checks that every parameter is finite; the loss is checked in every step.
@@ -86,8 +88,8 @@ def train(
             scene, repaired = load_with_agreeing_masks(config.data)
             require_readable(scene.test)
             scene = with_recorded_mirrors(config, scene, directory)
-            scene = with_library_body(config, scene, backend, directory)
-            scene = with_shape_prior_body(config, scene, backend, directory)
+            if config.guidance != GuidanceConfig():
+                scene = _with_prior_body(config, scene, backend, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)
             if matches_photos(config, scene):
@@ -95,7 +97,7 @@ def train(
 
                 scene = with_stereo_depths(scene, ENOUGH_AGREED, config.seed)
             plan = RunPlan.of(config, scene)
-            guidance = start_guidance(config, plan, scene, backend, directory)
+            guidance = _guidance(config, plan, scene, backend, directory)
             expected = require_memory(config, plan, scene, backend, guidance)
             directory.record(estimate=expected)
             trainer, clock = _start(plan, scene, backend, directory, guidance, began)
@@ -135,6 +137,26 @@ def require_readable(views: Sequence[View]) -> None:
     """Raise InputError for a held-out image that cannot be decoded, before the work that it is to evaluate."""
     for view in views:
         view.pixels()
+
+
+def _with_prior_body(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> Scene:
+    """The scene with the body that a library or a shape prior sees in it, where somebody asks for one."""
+    from gsopt.training.library_body import with_library_body
+    from gsopt.training.shape_prior_body import with_shape_prior_body
+
+    scene = with_library_body(config, scene, backend, directory)
+    return with_shape_prior_body(config, scene, backend, directory)
+
+
+def _guidance(
+    config: TrainConfig, plan: RunPlan, scene: Scene, backend: Backend, directory: RunDirectory
+) -> RunGuidance | None:
+    """Guidance of the run, or None; what it needs is imported only for a prior."""
+    if recorded_choice(plan, directory)["prior"] is None:
+        return None
+    from gsopt.training.guided.start import start_guidance
+
+    return start_guidance(config, plan, scene, backend, directory)
 
 
 def require_memory(

@@ -9,7 +9,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from gsopt.config.guidance import library_of, shape_prior_of
+from gsopt.config.guidance import GuidanceConfig, library_of, shape_prior_of
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.data.sfm.reuse import needs_poses, posed_scene
 from gsopt.data.sfm.settings import SfmConfig
@@ -18,13 +18,9 @@ from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import Gaussians
 from gsopt.init.cut_out import with_made_masks
 from gsopt.results.evaluation import OnView, evaluate, networks, read_metrics
-from gsopt.results.report import write_report
-from gsopt.training.guided.start import require_guidance
 from gsopt.training.interrupt import Stopped, StopRequest
-from gsopt.training.library_body import require_library
 from gsopt.training.loop import PROGRESS_SECONDS, TrainResult, train
 from gsopt.training.run_directory import Listener, RunDirectory, opened, refuse_another_run
-from gsopt.training.shape_prior_body import require_shape_prior
 
 
 @dataclass(frozen=True)
@@ -63,9 +59,7 @@ def reconstruct(
     config = _with_absolute_paths(_configured(data, run, config, resume, settings))
     if not resume:
         refuse_another_run(run)
-        require_guidance(config.guidance)
-        require_library(config.guidance)
-        require_shape_prior(config.guidance)
+        _require_prior(config.guidance)
     networks(vgg)
     read_metrics(run)
     config = _with_masks(_with_poses(config, run, log), run, log)
@@ -129,6 +123,19 @@ def _absolute(name: str) -> str:
     return str(path.absolute()) if name and path.exists() else name
 
 
+def _require_prior(config: GuidanceConfig) -> None:
+    """UsageError or InputError before any work for a prior, prompts or reference images that cannot be had."""
+    if config == GuidanceConfig():
+        return
+    from gsopt.training.guided.start import require_guidance
+    from gsopt.training.library_body import require_library
+    from gsopt.training.shape_prior_body import require_shape_prior
+
+    require_guidance(config)
+    require_library(config)
+    require_shape_prior(config)
+
+
 def _with_poses(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
     """Photos or a video without poses become a posed scene beside the run; anything else is left as it is."""
     data = Path(config.data.path)
@@ -169,6 +176,8 @@ def _evaluated(
         except Stopped:
             directory.emit("stopped", **ended)
             return None, None
+        from gsopt.results.report import write_report
+
         report = write_report(result.run)
         directory.emit("done", **ended)
     return metrics, report

@@ -29,11 +29,15 @@ class CleanPython:
     """Runs code in an interpreter of its own and returns the modules it loaded."""
 
     def loaded_after(self, code: str) -> set[str]:
-        """Top-level names in sys.modules after `code`; whatever `code` itself prints is dropped."""
+        """Top-level names of `modules_after`."""
+        return {name.partition(".")[0] for name in self.modules_after(code)}
+
+    def modules_after(self, code: str) -> set[str]:
+        """Names in sys.modules after `code`; whatever `code` itself prints is dropped."""
         script = (
             "import contextlib, io, json, sys\n"
             f"with contextlib.redirect_stdout(io.StringIO()):\n    exec({code!r})\n"
-            "print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+            "print(json.dumps(sorted(sys.modules)))"
         )
         done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr

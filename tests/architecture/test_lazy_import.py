@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from tiny_scenes import write_dataset
 
 from gsopt.cli import VERBS
 
@@ -27,6 +30,28 @@ def test_the_bottom_row_and_help_load_nothing_heavy(clean_python, code: str) -> 
 def test_help_of_a_verb_answers_without_torch(clean_python, verb: str) -> None:
     code = f"import gsopt.cli; assert gsopt.cli.main([{verb!r}, '--help']) == 0"
     assert clean_python.loaded_after(code) & HEAVY == set()
+
+
+OF_OTHER_RUNS = {
+    "diffusers",
+    "transformers",
+    "gsopt.data.sfm.pipeline",
+    "gsopt.llm_prompts",
+    "gsopt.sds.conditioning",
+    "gsopt.sds.guidance_step",
+    "gsopt.shape_library",
+    "gsopt.training.guided.guard",
+}
+"""What a run needs only with photos without poses, or with a prior."""
+
+
+def test_a_run_without_a_prior_imports_nothing_of_guidance(clean_python, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "scene")
+    words = ["--iterations", "2", "--init", "random", "--init-count", "20"]
+    command = ["train", str(tmp_path / "scene"), "-m", str(tmp_path / "run"), *words]
+    loaded = clean_python.modules_after(f"import gsopt.cli; assert gsopt.cli.main({command!r}) == 0")
+    assert "gsopt.training.trainer" in loaded
+    assert loaded & OF_OTHER_RUNS == set()
 
 
 def test_the_check_notices_a_heavy_import(clean_python) -> None:

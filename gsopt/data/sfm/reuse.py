@@ -9,7 +9,6 @@ from pathlib import Path
 from gsopt.data import files
 from gsopt.data.scene import is_posed
 from gsopt.data.sfm.photos import find_photos
-from gsopt.data.sfm.pipeline import RECORD, fingerprint, pose_photos
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import is_video
 from gsopt.errors import InputError
@@ -36,6 +35,8 @@ def posed_scene(data: Path, folder: Path, config: SfmConfig, report: Report) -> 
     if scene.exists():
         report(f"poses found earlier: {scene}")
         return scene
+    from gsopt.data.sfm.pipeline import pose_photos
+
     report(f"{data} has no poses: looking for them (gsopt sfm)")
     posed = pose_photos(data, scene, config, report)
     for line in posed.diagnosis.lines():
@@ -45,6 +46,8 @@ def posed_scene(data: Path, folder: Path, config: SfmConfig, report: Report) -> 
 
 def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
     """True when the scene was made from these very files, with the same seed."""
+    from gsopt.data.sfm.pipeline import RECORD, fingerprint
+
     record = scene / RECORD
     if not files.is_regular(record) or not is_posed(scene):
         return False

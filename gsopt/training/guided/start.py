@@ -14,6 +14,7 @@ from gsopt.sds.conditioning import Conditioning
 from gsopt.sds.guidance_step import Guidance, GuidanceSetup
 from gsopt.sds.load_prior import open_prior
 from gsopt.sds.select_prior import select_prior
+from gsopt.training.guided.choice import recorded_choice
 from gsopt.training.guided.guard import Verdict, evaluate_guidance
 from gsopt.training.guided.references import (
     CONDITIONING,
@@ -43,11 +44,7 @@ def start_guidance(
     A resumed run keeps the choice it began with. Raises UsageError and InputError before any training when the prior
     that was asked for cannot be had.
     """
-    recorded = directory.recorded("guidance")
-    if recorded is None:
-        recorded = {"prior": plan.prior.name, "lambda_sds": plan.prior.weight, "reason": plan.prior.reason}
-        if plan.prior.name is None:
-            directory.record(guidance=recorded)
+    recorded = recorded_choice(plan, directory)
     if recorded["prior"] is None:
         return None
     setup = _opened(config, scene, recorded, directory)
