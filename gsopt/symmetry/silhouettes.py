@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gsopt.geometry.projection import project
@@ -133,10 +133,20 @@ def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, 
     `finer` than the pixels."""
     planes = torch.nn.functional.interpolate(alpha[None], scale_factor=finer, mode="bilinear", align_corners=False)[0]
     solid, reach = planes > 0.5, MAX_DISTANCE * finer
+    distance = torch.full(solid.shape, 0.5 - reach)
+    rows, columns = (_span(solid[0].any(1 - axis), reach) for axis in (0, 1))
+    near = solid[:, rows, columns]  # all else is farther than that
     inner, outer = (
-        squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~solid, solid)
+        squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~near, near)
     )
-    return torch.where(solid, inner, -outer) / finer
+    distance[:, rows, columns] = torch.where(near, inner, -outer)
+    return distance / finer
+
+
+def _span(occupied: Bool[Tensor, "N"], margin: int) -> slice:
+    """From the first true place to the last and a margin on both sides; empty where there is none."""
+    places = torch.nonzero(occupied)[:, 0].tolist()
+    return slice(max(0, places[0] - margin), places[-1] + margin + 1) if places else slice(0, 0)
 
 
 def outline_pixels(outline: Outline) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:

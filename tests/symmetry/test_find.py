@@ -122,6 +122,17 @@ def test_twice_the_same_bits(tmp_path: Path) -> None:
     assert torch.equal(again.element.normal, Symmetry.from_dict(second[0]).element.normal)
 
 
+@pytest.mark.parametrize("views", [4, 8])
+def test_the_first_look_on_coarser_voxels_loses_no_mirror(
+    views: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()), views)
+    looked = [symmetry.to_dict() for symmetry in find_symmetries(scene)]
+    monkeypatch.setattr("gsopt.symmetry.search.HOPELESS", 1.0)
+    assert looked == [symmetry.to_dict() for symmetry in find_symmetries(scene)]
+    assert looked
+
+
 def test_mirror_images_are_flipped_photos_seen_from_behind(tmp_path: Path) -> None:
     scene = scene_of(tmp_path / "thing", mirrored(HALF, slanted()))
     plain, painted = Symmetry(slanted(), 0.0, 0.0), Symmetry(slanted(), 0.0, 1.0)
