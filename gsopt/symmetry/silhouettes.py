@@ -136,9 +136,7 @@ def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, 
     distance = torch.full(solid.shape, 0.5 - reach)
     rows, columns = (_span(solid[0].any(1 - axis), reach) for axis in (0, 1))
     near = solid[:, rows, columns]  # all else is farther than that
-    inner, outer = (
-        squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~near, near)
-    )
+    inner, outer = (squared_distance(other, reach).float().clamp(max=reach**2).sqrt() - 0.5 for other in (~near, near))
     distance[:, rows, columns] = torch.where(near, inner, -outer)
     return distance / finer
 
