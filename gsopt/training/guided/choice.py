@@ -9,8 +9,8 @@ from gsopt.training.run_directory import RunDirectory
 
 
 def recorded_choice(plan: RunPlan, directory: RunDirectory) -> dict[str, Any]:
-    """`prior` (null without one), `lambda_sds` and `reason`; what a resumed run began with. That there is no prior is
-    final, so it is recorded at once."""
+    """`prior` (null without one), `lambda_sds` and `reason`; what a resumed run began with. No prior is a
+    final choice, recorded at once."""
     recorded: dict[str, Any] | None = directory.recorded("guidance")
     if recorded is not None:
         return recorded
