@@ -70,7 +70,10 @@ def test_a_single_input_view_still_has_an_orbit(tmp_path: Path) -> None:
 def test_eval_prints_the_figures_and_writes_both_files(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli_eval.main([str(run)]) == 0
     printed = capsys.readouterr().out
-    assert "Held-out views (2): PSNR 100.00 dB, SSIM 1.0000, LPIPS (Alex) 0.0000\n" in printed
+    assert (
+        "Held-out views (2): PSNR 100.00 dB, SSIM 1.0000, LPIPS (Alex) 0.0000, PSNR color-corrected 100.00 dB\n"
+        in printed
+    )
     assert json.loads((run / "metrics.json").read_text())["mean"]["psnr"] == 100
     assert (run / "report.html").is_file()
 

@@ -347,10 +347,10 @@ def test_a_held_out_view_stands_beside_its_render_and_error(recorder: Recorder, 
     made = make_run(tmp_path, test=2)
     config = TrainConfig.read(made / "config.json")
     views = load_scene(config.data).test
-    panel = viewer_controls.held_out_views(recorder.server, views, config)
+    panel = viewer_controls.held_out_views(recorder.server, views, config, made)
     assert panel is not None
     right, nothing = (panel.panes(model) for model in (splats(), splats().select(torch.zeros(0, dtype=torch.int64))))
     truth, render, error = np.split(right, 3, axis=1)
     assert np.abs(truth.astype(int) - render).mean() < 6
     assert error.mean() < np.split(nothing, 3, axis=1)[2].mean()
-    assert viewer_controls.held_out_views(recorder.server, (), config) is None
+    assert viewer_controls.held_out_views(recorder.server, (), config, made) is None

@@ -196,9 +196,9 @@ def test_every_eighth_step_draws_the_whole_image(dataset: Path, monkeypatch: pyt
     monkeypatch.setattr("gsopt.training.content_window.MARGIN", 0)
     monkeypatch.setattr("gsopt.training.content_window.TILE", 1)
 
-    def note(trainer: Trainer, target: Target, *args):
+    def note(trainer: Trainer, index: int, target: Target, *args):
         seen.append(target.colors.shape[0] * target.colors.shape[1])
-        return original(trainer, target, *args)
+        return original(trainer, index, target, *args)
 
     monkeypatch.setattr(Trainer, "_gradients", note)
     passed_steps(dataset, ScheduleConfig(coarse_until=(), crop_masked=True))
