@@ -54,7 +54,7 @@ fuzz: $(VENV)/.for-test
 	$(PIP) atheris
 	$(PY) tests/fuzz/campaign.py $(SECONDS)
 
-# Random changes of the code, COUNT of them, one at a time: does a test notice? An hour for about 60 on one core.
+# Random changes of the code, COUNT of them, one at a time: does a test notice?
 COUNT ?= 60
 mutants: $(VENV)/.for-test
 	$(PY) tests/mutants/mutate.py --count $(COUNT) --json experiments/results/mutants.json

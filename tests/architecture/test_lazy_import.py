@@ -42,7 +42,7 @@ OF_OTHER_RUNS = {
     "gsopt.shape_library",
     "gsopt.training.guided.guard",
 }
-"""What a run needs only with photos without poses, or with a prior."""
+"""A run imports these only for photos without poses, or for a prior."""
 
 
 def test_a_run_without_a_prior_imports_nothing_of_guidance(clean_python, tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ FORMATS: dict[str, Change] = {
 
 
 def ours(path: Path) -> Gaussians | None:
-    """What gsopt reads, or None where it refuses."""
+    """Reads a file with gsopt; returns None where it refuses."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -95,7 +95,7 @@ def ours(path: Path) -> Gaussians | None:
 
 
 def theirs(program: Path, path: Path, folder: Path) -> Gaussians | None:
-    """What splat-transform reads, by way of the PLY that it writes, or None where it fails."""
+    """Reads a file with splat-transform, by way of the PLY that it writes; returns None where it fails."""
     target = folder / "theirs.ply"
     target.unlink(missing_ok=True)
     turn = HALF_TURN if path.suffix == ".spz" else []

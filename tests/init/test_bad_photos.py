@@ -24,7 +24,7 @@ CUT = 1
 
 
 def test_a_background_that_moves_changes_no_bit_inside_masks(tmp_path: Path) -> None:
-    """What lies outside the masks is other in every photo, and then other again."""
+    """Passers-by stand outside the masks, others in every photo, and then others again."""
     data = photos(tmp_path / "data", COUNT)
     mask = tmp_path / "data" / "masks" / "train"
     for path in mask.iterdir():  # hard edges: no pixel is half background
@@ -45,7 +45,7 @@ def trained(data: DataConfig, run: Path) -> bytes:
 
 
 def test_an_object_that_the_frame_cuts_off_is_not_carved_there(tmp_path: Path) -> None:
-    """What lies outside a photo is unknown: no mask is blamed, and the hull is whole."""
+    """A photo says nothing about what lies beyond its frame: no mask is blamed, and the hull is whole."""
     whole = load_scene(photos(tmp_path / "whole", COUNT))
     config = photos(tmp_path / "cut", COUNT)
     shifted(tmp_path / "cut", [SIZE // 3, 0])
