@@ -239,6 +239,10 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
         row.operator("gsopt.look_through", text="", icon="TRIA_LEFT").step = -1
         row.operator("gsopt.look_through", text="", icon="TRIA_RIGHT").step = 1
         layout.prop(settings, "picture", text="Input Picture", slider=True)
+        row = layout.row(align=True)
+        row.label(text="Camera path")
+        row.operator("gsopt.import_camera_path", text="", icon="IMPORT")
+        row.operator("gsopt.export_camera_path", text="", icon="EXPORT")
         active = context.view_layer.objects.active
         if splat_object.is_splats(active):
             draw_display(layout, active)

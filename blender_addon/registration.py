@@ -9,6 +9,7 @@ from bpy.app.handlers import persistent
 
 from . import (
     mesh_proxy,
+    operators_camera_path,
     operators_cameras,
     operators_guidance,
     operators_inspect,
@@ -34,6 +35,7 @@ CLASSES = (
     *mesh_proxy.CLASSES,
     *operators_scale.CLASSES,
     *operators_cameras.CLASSES,
+    *operators_camera_path.CLASSES,
     *operators_inspect.CLASSES,
     *panel.CLASSES,
 )

@@ -105,11 +105,13 @@ def merged(source: Path, gaussians: Gaussians, share: float) -> Gaussians:
 def write_page(source: Path, gaussians: Gaussians, out: Path, antialiased: bool) -> None:
     """The page of a run, with its cameras, or of a file."""
     from gsopt.results import web
+    from gsopt.results.measure import units_of
 
     if (source / "config.json").is_file():
         web.save_run_page(out, source)
     else:
-        web.save_page(out, gaussians, web.scene_of_splats(gaussians, source.name, antialiased=antialiased))
+        units = units_of(source)
+        web.save_page(out, gaussians, web.scene_of_splats(gaussians, source.name, antialiased=antialiased, units=units))
 
 
 def note_losses(suffix: str, sh_degree: int, antialiased: bool) -> None:

@@ -29,6 +29,11 @@ _RIGID = 1e-3
 
 def write_camera_path(path: Path, cameras: list[Cameras], fps: float, origin: Point = NOWHERE) -> None:
     """Write cameras of one size; the principal point is taken to be the middle."""
+    write_atomic(path, encoded_camera_path(cameras, fps, origin))
+
+
+def encoded_camera_path(cameras: list[Cameras], fps: float, origin: Point = NOWHERE) -> bytes:
+    """The bytes of such a file."""
     height, width = cameras[0].height, cameras[0].width
     entries = []
     for camera in cameras:
@@ -45,7 +50,7 @@ def write_camera_path(path: Path, cameras: list[Cameras], fps: float, origin: Po
         "camera_path": entries,
         "keyframes": [],
     }
-    write_atomic(path, to_json(document))
+    return to_json(document)
 
 
 def read_camera_path(path: Path, origin: Point = NOWHERE) -> list[Cameras]:

@@ -25,11 +25,13 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.quats import from_rotation_matrices
 from gsopt.raster.reference import covariances
 from gsopt.results.finished_run import truth
+from gsopt.results.measure import units_of
 from gsopt.results.report.embedded_images import shrunk
 from gsopt.results.run_follower import RunFollower
 from gsopt.results.unseen import marked, unseen
 from gsopt.results.video import as_image
 from gsopt.results.viewer_controls import HeldOutViews, RunControls, held_out_views
+from gsopt.results.viewer_path import KeyframeControls
 from gsopt.results.viewer_server import start_server
 from gsopt.results.web.scene import framed
 
@@ -62,6 +64,7 @@ class SplatViewer:
         self._unseen: Tensor | None = None
         self._eye = self._seen_from = torch.zeros(3)
         self._add_look_controls()
+        self.keyframes = KeyframeControls(self._server)
         self._server.on_client_connect(lambda client: client.camera.on_update(self._follow_eye))
 
     def _add_look_controls(self) -> None:
@@ -203,6 +206,7 @@ def view_file(viewer: SplatViewer, path: Path) -> None:
     """Show one splat file."""
     gaussians = load_splats(path)
     center, radius = center_and_radius(gaussians.means)
+    viewer.keyframes.origin = units_of(path).origin
     viewer.show_splats(gaussians, path.name)
     viewer.look_from(center + radius * torch.tensor([2.0, 2.0, 1.0]), center)
 
@@ -214,6 +218,7 @@ def view_run(viewer: SplatViewer, run: Path) -> Iterator[str]:
     scene, notice = scene_or_notice(config)
     if notice:
         yield notice
+    viewer.keyframes.origin = units_of(run).origin
     controls, held_out = viewer.add_run(run, scene, config)
     framed = False
     while True:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -11,7 +16,10 @@ from finished_runs import make_run, ring
 
 from gsopt.cli import main
 from gsopt.errors import InputError
+from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.quats import from_rotation_matrices
 from gsopt.results.camera_path_file import read_camera_path, write_camera_path
+from gsopt.results.viewer_path import KeyframeControls
 
 ORIGIN = (1000.0, -2000.0, 5.0)
 
@@ -82,3 +90,47 @@ def test_a_broken_file_is_bad_data_in_one_line(tmp_path: Path, capsys, change: d
         read_camera_path(path)
     assert main(["render", str(make_run(tmp_path)), "--path", str(path)]) == 3
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def visitor(camera: Cameras) -> SimpleNamespace:
+    """A browser of viser whose camera stands where this one does."""
+    world_from_cam = torch.linalg.inv(camera.viewmats[0].double())
+    return SimpleNamespace(
+        camera=SimpleNamespace(
+            wxyz=from_rotation_matrices(world_from_cam[:3, :3]).numpy(),
+            position=world_from_cam[:3, 3].numpy(),
+            look_at=(0.0, 0.0, 0.0),
+            fov=2 * math.atan(camera.height / 2 / float(camera.Ks[0, 1, 1])),
+            image_width=camera.width,
+            image_height=camera.height,
+        ),
+        send_file_download=MagicMock(),
+        add_notification=MagicMock(),
+        atomic=contextlib.nullcontext,
+    )
+
+
+def test_keyframes_of_the_viewer_are_saved_as_a_path_through_them(tmp_path: Path, monkeypatch) -> None:
+    shots = ring(3)
+    controls = KeyframeControls(MagicMock())
+    controls.origin = ORIGIN
+    guests = [visitor(shots[i]) for i in range(3)]
+    controls.save(guests[0])
+    guests[0].add_notification.assert_called_once()
+    guests[0].send_file_download.assert_not_called()
+    for guest in (*guests, guests[0]):
+        controls.add(guest)
+    controls.remove(guests[0])
+    controls.save(guests[0])
+    name, data = guests[0].send_file_download.call_args.args
+    (tmp_path / name).write_bytes(data)
+    found = read_camera_path(tmp_path / name, ORIGIN)
+    assert len(found) == 97
+    for row, place in enumerate((0, 48, 96)):
+        assert torch.allclose(found[place].viewmats[0], shots.viewmats[row], atol=1e-4)
+        assert torch.allclose(found[place].Ks[0], shots.Ks[row], rtol=1e-4)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    controls.play(guests[0])
+    assert torch.allclose(torch.tensor(guests[0].camera.position), shots.centers[2].double(), atol=1e-4)
+    ahead = torch.tensor(guests[0].camera.look_at) - torch.tensor(guests[0].camera.position)
+    assert torch.allclose(ahead / ahead.norm(), shots.forwards[2].double(), atol=1e-4)

@@ -12,6 +12,7 @@ from string import Template
 from gsopt.results.web.payload import Payload
 from gsopt.results.web.scene import WebScene
 
+PROGRAM = ("shaders.js", "keyframes.js", "viewer.js")
 STYLE = "html, body { margin: 0; height: 100%; } .gsopt-viewer { height: 100%; }\n"
 
 
@@ -59,7 +60,7 @@ def policy() -> str:
 
 
 def _program() -> str:
-    return _resource("shaders.js") + _resource("viewer.js")
+    return "".join(map(_resource, PROGRAM))
 
 
 def _resource(name: str) -> str:

@@ -11,11 +11,13 @@ from torch import Tensor
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import GsoptError
+from gsopt.formats.units import UNKNOWN, Units
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.camera_paths import turntable_path
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus, up_direction
 from gsopt.results.finished_run import FinishedRun, look_at_point
+from gsopt.results.measure import units_of
 
 MAX_VIEWS = 200
 PATH_POSES, PATH_SECONDS = 72, 20.0
@@ -45,6 +47,7 @@ class WebScene:
     up: Tensor
     background: tuple[float, float, float]
     antialiased: bool
+    units: Units = UNKNOWN
 
     def to_json(self) -> dict[str, Any]:
         """The values that viewer.js reads."""
@@ -60,6 +63,7 @@ class WebScene:
             "up": numbers(self.up),
             "background": list(self.background),
             "antialiased": self.antialiased,
+            "origin": list(self.units.origin),
             "cameraSize": CAMERA_SIZE * max(distance, 1e-6),
         }
 
@@ -81,7 +85,9 @@ def scene_of_run(run: FinishedRun) -> WebScene:
     try:
         scene = load_scene(run.config.data)
     except GsoptError:
-        return scene_of_splats(run.gaussians, run.path.name, run.background, run.settings.antialiased)
+        return scene_of_splats(
+            run.gaussians, run.path.name, run.background, run.settings.antialiased, units_of(run.path)
+        )
     return scene_of_views(run, scene)
 
 
@@ -103,6 +109,7 @@ def scene_of_views(run: FinishedRun, scene: Scene) -> WebScene:
         up=up_direction(cameras.viewmats),
         background=tuple(run.background.tolist()),
         antialiased=run.settings.antialiased,
+        units=units_of(run.path),
     )
 
 
@@ -137,7 +144,11 @@ def size_of(views: list[tuple[str, Cameras]]) -> tuple[int, int]:
 
 
 def scene_of_splats(
-    gaussians: Gaussians, title: str, background: Tensor | None = None, antialiased: bool = False
+    gaussians: Gaussians,
+    title: str,
+    background: Tensor | None = None,
+    antialiased: bool = False,
+    units: Units = UNKNOWN,
 ) -> WebScene:
     """One view of splats whose cameras are not known: from the front of a PLY's frame, around their solid middle."""
     means = (
@@ -151,4 +162,5 @@ def scene_of_splats(
     K = torch.tensor([[f, 0, DEFAULT_SIZE / 2], [0, f, DEFAULT_SIZE / 2], [0, 0, 1]])
     camera = Cameras(viewmats=viewmat[None], Ks=K[None], width=DEFAULT_SIZE, height=DEFAULT_SIZE)
     color = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
-    return WebScene(title, [("", camera)], camera, 0, None, center, torch.tensor([0.0, -1, 0]), color, antialiased)
+    up = torch.tensor([0.0, -1, 0])
+    return WebScene(title, [("", camera)], camera, 0, None, center, up, color, antialiased, units)

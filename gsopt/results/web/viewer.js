@@ -38,6 +38,14 @@ class Camera {
     const [fx, fy, cx, cy, w, h] = this.lens, s = Math.min(width / w, height / h);
     return [fx * s, fy * s, width / 2 + (cx - w / 2) * s, height / 2 + (cy - h / 2) * s];
   }
+  // Turned to the middle of its image, where files of camera paths have the principal point.
+  centered() {
+    const [fx, fy, cx, cy, w, h] = this.lens, x = (w / 2 - cx) / fx, y = (h / 2 - cy) / fy;
+    const forward = unit(add(add(this.forward, this.right, x), this.down, y)), f = fy * Math.hypot(1, x, y);
+    const right = unit(cross(this.down, forward));
+    return new Camera({ eye: [...this.eye], axes: [...right, ...cross(forward, right), ...forward],
+                        lens: [f, f, w / 2, h / 2, w, h] });
+  }
   depthRow() { return [...this.forward, -dot(this.forward, this.eye)]; }
   camFromWorld() {  // column by column
     const rows = [this.right, this.down, this.forward], t = rows.map(row => -dot(row, this.eye));
@@ -195,7 +203,7 @@ class Viewer {
     this.part = name => root.querySelector(`[data-part=${name}]`);
     const scene = this.scene = JSON.parse(this.part("scene").textContent);
     this.views = scene.views.map(view => new Camera(view));
-    this.path = scene.path.map(view => new Camera(view));
+    this.turntable = { cameras: scene.path.map(view => new Camera(view)), seconds: scene.pathSeconds };
     this.look = { scale: 1, degree: scene.degree, background: scene.background, cameras: false };
     this.renderer = new Renderer(this.part("canvas"), scene);
     this.renderer.setWires(this.views.slice(0, scene.inputs), scene.cameraSize);
@@ -299,9 +307,9 @@ class Viewer {
     this.redraw();
   }
   advance(now) {
-    const at = Math.max(0, now - this.started) / 1000 / this.scene.pathSeconds * this.path.length;
-    const i = Math.floor(at) % this.path.length;
-    this.camera = this.path[i].between(this.path[(i + 1) % this.path.length], at % 1);
+    const { cameras, seconds } = this.course, count = cameras.length;
+    const at = Math.max(0, now - this.started) / 1000 / seconds * count, i = Math.floor(at) % count;
+    this.camera = cameras[i].between(cameras[(i + 1) % count], at % 1);
     this.move();
   }
 }
@@ -354,14 +362,14 @@ function connectControls(viewer) {
   const home = () => { leave(); viewer.goHome(); viewer.move(); };
   canvas.addEventListener("keydown", event => {
     const action = { ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: home,
-                     " ": () => viewer.play(!viewer.playing) }[event.key];
+                     k: () => viewer.keyframes.add(), " ": () => viewer.play(!viewer.playing) }[event.key];
     if (action) { event.preventDefault(); action(); }
   });
   viewer.part("before").onclick = () => step(-1);
   viewer.part("after").onclick = () => step(1);
   viewer.part("home").onclick = home;
   viewer.part("play").onclick = () => viewer.play(!viewer.playing);
-  viewer.part("play").hidden = viewer.path.length < 2;
+  viewer.keyframes = new Keyframes(viewer);
   connectLook(viewer);
 }
 

@@ -17,6 +17,7 @@ from gsopt.cli import main
 from gsopt.data.scene import load_scene
 from gsopt.events import EventWriter
 from gsopt.gaussians import Gaussians
+from gsopt.results.camera_path_file import read_camera_path
 from gsopt.results.finished_run import open_run
 from gsopt.results.web import save_run_page
 
@@ -107,6 +108,41 @@ def test_the_mouse_turns_and_keys_step_through_the_views(browser: Tab, run: Path
     again = changed(browser, "document.querySelector('[data-part=after]').click()")
     expected = shown(browser, run / "page.html", "view=2&plain")
     assert psnr(again, expected) > 60
+
+
+def clicked(part: str) -> str:
+    return f"document.querySelector('[data-part={part}]').click()"
+
+
+def test_keyframes_are_played_and_saved_as_a_path_that_render_reads(browser: Tab, run: Path, tmp_path: Path) -> None:
+    """The path goes through the three input cameras in their order, and the page plays it in place of the turntable."""
+    shown(browser, run / "page.html", "view=1")
+    browser.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    saving = "document.querySelector('[data-part=save]').disabled"
+    assert browser.value(saving) is True
+    for _ in range(3):
+        browser.value(clicked("keyframe"))
+        browser.value(clicked("after"))
+    browser.value(clicked("keyframe"))
+    browser.value(clicked("undo"))
+    assert browser.value("document.querySelector('[data-part=path]').textContent") == "3 keyframes, 4 s"
+    browser.value(clicked("save"))
+    end = time.monotonic() + PATIENCE
+    while not (tmp_path / "camera-path.json").is_file():
+        assert time.monotonic() < end, "nothing was downloaded"
+        time.sleep(0.1)
+    cameras = read_camera_path(tmp_path / "camera-path.json")
+    views = load_scene(open_run(run).config.data).train
+    assert len(cameras) == 97
+    for view, camera in zip(views, (cameras[0], cameras[48], cameras[96]), strict=True):
+        torch.testing.assert_close(camera.viewmats, view.camera.viewmats, atol=1e-4, rtol=0)
+        torch.testing.assert_close(camera.Ks, view.camera.Ks.to(camera.Ks), atol=1e-3, rtol=0)
+    smooth = torch.stack([camera.centers[0] for camera in cameras]).diff(dim=0).norm(dim=1)
+    assert smooth.max() < 2.5 * smooth.mean()
+    browser.value(clicked("play"))
+    browser.wait_for("document.querySelector('[data-part=play]').textContent === 'Stop'")
+    assert changed(browser, clicked("play")).std() > 10
+    assert browser.complaints == []
 
 
 def test_the_report_shows_the_splats(browser: Tab, run: Path) -> None:
