@@ -18,6 +18,7 @@ from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.formats import load_splats
+from gsopt.formats.units import Units
 from gsopt.formats.validation import MAX_SH_DEGREE
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
@@ -31,6 +32,7 @@ from gsopt.results.run_follower import RunFollower
 from gsopt.results.unseen import marked, unseen
 from gsopt.results.video import as_image
 from gsopt.results.viewer_controls import HeldOutViews, RunControls, held_out_views
+from gsopt.results.viewer_measure import MeasureControls
 from gsopt.results.viewer_path import KeyframeControls
 from gsopt.results.viewer_server import start_server
 from gsopt.results.web.scene import framed
@@ -65,6 +67,7 @@ class SplatViewer:
         self._eye = self._seen_from = torch.zeros(3)
         self._add_look_controls()
         self.keyframes = KeyframeControls(self._server)
+        self.measure = MeasureControls(self._server, lambda: self._gaussians)
         self._server.on_client_connect(lambda client: client.camera.on_update(self._follow_eye))
 
     def _add_look_controls(self) -> None:
@@ -178,6 +181,10 @@ class SplatViewer:
         views = scene.test if scene else ()
         return RunControls(self._server, run), held_out_views(self._server, views, config, run)
 
+    def set_units(self, units: Units) -> None:
+        """Takes on the scale and origin of what is shown: lengths in meters, paths in the frame of the dataset."""
+        self.keyframes.origin, self.measure.units = units.origin, units
+
     def stop(self) -> None:
         self._server.stop()
 
@@ -206,7 +213,7 @@ def view_file(viewer: SplatViewer, path: Path) -> None:
     """Show one splat file."""
     gaussians = load_splats(path)
     center, radius = center_and_radius(gaussians.means)
-    viewer.keyframes.origin = units_of(path).origin
+    viewer.set_units(units_of(path))
     viewer.show_splats(gaussians, path.name)
     viewer.look_from(center + radius * torch.tensor([2.0, 2.0, 1.0]), center)
 
@@ -218,7 +225,7 @@ def view_run(viewer: SplatViewer, run: Path) -> Iterator[str]:
     scene, notice = scene_or_notice(config)
     if notice:
         yield notice
-    viewer.keyframes.origin = units_of(run).origin
+    viewer.set_units(units_of(run))
     controls, held_out = viewer.add_run(run, scene, config)
     framed = False
     while True:

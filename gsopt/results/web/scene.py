@@ -64,6 +64,7 @@ class WebScene:
             "background": list(self.background),
             "antialiased": self.antialiased,
             "origin": list(self.units.origin),
+            "metersPerUnit": self.units.meters_per_unit,
             "cameraSize": CAMERA_SIZE * max(distance, 1e-6),
         }
 

@@ -232,8 +232,9 @@ class Viewer {
     this.worker.postMessage({ bytes, scene: this.scene, geometryTexels: texels(2 * this.scene.count),
                               colorTexels: texels(this.scene.colorStride * this.scene.count) }, [bytes.buffer]);
   }
-  receive({ error, shapes, tints, order }) {
+  receive({ error, shapes, tints, order, point }) {
     if (error) return this.say(error);
+    if (point !== undefined) return this.measure.receive(point);
     if (shapes) {
       this.renderer.upload(shapes, tints);
       this.ready = true;
@@ -292,6 +293,7 @@ class Viewer {
     if (moving && this.lastFrame) this.adapt(now - this.lastFrame);
     this.lastFrame = moving ? now : 0;
     this.renderer.draw(this.camera, this.look, moving ? this.quality : 1);
+    this.measure.draw(this.camera);
     if (moving || this.playing) this.redraw();
     else if (this.sortedFor === this.moved) this.root.dataset.drawn = this.number + 1;
   }
@@ -370,6 +372,7 @@ function connectControls(viewer) {
   viewer.part("home").onclick = home;
   viewer.part("play").onclick = () => viewer.play(!viewer.playing);
   viewer.keyframes = new Keyframes(viewer);
+  viewer.measure = new Measure(viewer);
   connectLook(viewer);
 }
 

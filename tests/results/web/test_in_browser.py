@@ -19,6 +19,8 @@ from gsopt.events import EventWriter
 from gsopt.gaussians import Gaussians
 from gsopt.results.camera_path_file import read_camera_path
 from gsopt.results.finished_run import open_run
+from gsopt.results.measure import units_of
+from gsopt.results.picking import surface_along
 from gsopt.results.web import save_run_page
 
 DRAWN = "document.querySelector('.gsopt-viewer').dataset.drawn"
@@ -143,6 +145,45 @@ def test_keyframes_are_played_and_saved_as_a_path_that_render_reads(browser: Tab
     browser.wait_for("document.querySelector('[data-part=play]').textContent === 'Stop'")
     assert changed(browser, clicked("play")).std() > 10
     assert browser.complaints == []
+
+
+def pressed(browser: Tab, x: float, y: float) -> None:
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+
+def test_two_picked_points_show_their_distance_and_the_command_for_the_scale(
+    browser: Tab, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page picks the points that gsopt's own function finds along the same rays, up to the codes of the splats."""
+    shown(browser, run / "page.html", "view=1", scale=20)
+    browser.value(clicked("measure"))
+    part = "document.querySelector('[data-part={}]')"
+    assert browser.value(part.format("length") + ".textContent") == "Click two points."
+    finished = open_run(run)
+    camera = load_scene(finished.config.data).train[0].camera
+    points = []
+    for x, y in ((380.0, 300.0), (300.0, 380.0)):
+        before = len(points)
+        pressed(browser, x, y)
+        browser.wait_for(f"document.querySelectorAll('circle[r=\"5\"]').length === {before + 1}")
+        pixel = torch.tensor([x / 20, y / 20, 1.0])
+        ray = camera.viewmats[0, :3, :3].T @ torch.linalg.solve(camera.Ks[0], pixel)
+        points.append(surface_along(finished.gaussians, camera.centers[0], ray, 20 * float(camera.Ks[0, 0, 0])))
+    distance = float((points[1] - points[0]).norm())
+    words = browser.value(part.format("length") + ".textContent").split()
+    assert words[1] == "units"
+    assert float(words[0]) == pytest.approx(distance, abs=0.02)
+    browser.value(f"{part.format('known')}.value = '50 cm'; {part.format('known')}.dispatchEvent(new Event('input'))")
+    assert browser.value(part.format("length") + ".textContent") == "50 cm"
+    assert browser.value("document.querySelector('svg text').textContent") == "50 cm"
+    command = browser.value(part.format("command") + ".value").split()
+    other = make_run(tmp_path)
+    assert main(["measure", str(other), *command[3:]]) == 0
+    scale = float(capsys.readouterr().out.split(" scene unit is ")[1].split()[0])
+    assert scale == pytest.approx(0.5 / distance, rel=0.05)
+    save_run_page(tmp_path / "a.html", other)
+    assert f'"metersPerUnit":{units_of(other).meters_per_unit}' in (tmp_path / "a.html").read_text(encoding="utf-8")
 
 
 def test_the_report_shows_the_splats(browser: Tab, run: Path) -> None:
