@@ -23,6 +23,7 @@ VERBS = {
     "eval": "judge a finished run by its held-out views",
     "export": "write splats in another format",
     "clean": "leave out splats that no input view needs",
+    "merge": "put the splats of two runs of one object together",
     "mesh": "turn the splats of a run into a closed mesh",
     "measure": "measure lengths, and give a run its scale",
     "view": "look at a run or a splat file in the browser",

@@ -1,0 +1,167 @@
+"""Merges two runs of one object: the splats of the second come into the frame of the first, each place from one run.
+
+The similarity between the frames follows from photos that both runs have. In a place that both have splats in, those
+stay that more of their own input views see: the others guess there, and both together would be twice as dense.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gsopt.data.refined_poses import with_refined_poses
+from gsopt.data.scene import Scene, View, load_scene
+from gsopt.data.sfm.placement import Similarity
+from gsopt.data.sfm.trajectory import align, centers, compare
+from gsopt.errors import InputError
+from gsopt.formats.placement import placed
+from gsopt.gaussians import Gaussians
+from gsopt.results.clean import observe
+from gsopt.results.decimate import masses
+from gsopt.results.finished_run import FinishedRun
+
+MIN_SHARED = 3
+MAX_DEGREES, MAX_SHIFT = 2.0, 0.05
+"""Most by which the median photo may stand otherwise in the second run: turned, and moved, in radii of the cameras."""
+CELLS = 32
+"""Cells along the largest side of the solid splats; each takes its splats from one run."""
+FARTHEST = 1 << 18
+"""Cells beyond this one count as this one."""
+TIE = 1e-6
+SOLID, INNER_SHARE = 0.5, 0.98
+"""The solid splats are those of at least this opacity, the farthest few left out."""
+REMEDY = (
+    "Give both runs three or more photos in common, under the same names: add some of the first's photos to the second "
+    "(gsopt sfm finds the poses), or train one run on all photos."
+)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The second run in the frame of the first."""
+
+    similarity: Similarity
+    photos: int
+    """Photos that both have."""
+    degrees: float
+    """Angle between the median photo's two directions."""
+    shift: float
+    """Distance of the median photo's two places, in radii of the cameras."""
+
+    def place(self, gaussians: Gaussians) -> Gaussians:
+        """Splats of the second run in the frame of the first."""
+        found = self.similarity
+        return placed(gaussians, found.scale, torch.from_numpy(found.rotation), torch.from_numpy(found.translation))
+
+    def place_back(self, gaussians: Gaussians) -> Gaussians:
+        """Splats of the first run in the frame of the second."""
+        scale, turn = 1 / self.similarity.scale, torch.from_numpy(self.similarity.rotation.T.copy())
+        return placed(gaussians, scale, turn, -scale * turn @ torch.from_numpy(self.similarity.translation))
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The splats of both runs in the frame of the first."""
+
+    gaussians: Gaussians
+    alignment: Alignment
+    kept: tuple[int, int]
+    """Splats of the first and of the second that stay."""
+
+
+def merge(first: FinishedRun, second: FinishedRun) -> Merged:
+    """Both runs in one. InputError where no photos in common say how they lie to each other."""
+    if first.settings.antialiased != second.settings.antialiased:
+        raise InputError("One run was trained with --antialiased, the other without. Train both alike.")
+    scenes = [with_refined_poses(load_scene(run.config.data), run.path) for run in (first, second)]
+    alignment = align_by_photos(*scenes)
+    seen = [
+        observe(run.gaussians, scene.train, run.backend).views
+        for run, scene in zip((first, second), scenes, strict=True)
+    ]
+    a, b = first.gaussians, alignment.place(second.gaussians)
+    stays = better_seen(a, b, *seen)
+    degree = max(a.sh_degree, b.sh_degree)
+    both = with_degree(a.select(stays[0]), degree).append(with_degree(b.select(stays[1]), degree))
+    return Merged(both, alignment, (int(stays[0].sum()), int(stays[1].sum())))
+
+
+def align_by_photos(first: Scene, second: Scene) -> Alignment:
+    """The similarity that the poses of photos of one name give; InputError where they are few or disagree."""
+    there = {view.name: view for view in (*first.train, *first.test)}
+    shared = [view for view in (*second.train, *second.test) if view.name in there]
+    if len(shared) < MIN_SHARED:
+        raise InputError(f"The runs must share {MIN_SHARED} photos to be merged, got {len(shared)}. {REMEDY}")
+    poses, fixed = stacked(shared), stacked([there[view.name] for view in shared])
+    error = compare(poses, fixed)
+    degrees, shift = float(np.median(error.rotation_degrees)), float(np.median(error.position))
+    if not (degrees <= MAX_DEGREES and shift <= MAX_SHIFT):
+        raise InputError(
+            f"{len(shared)} photos have the same names in both runs, but stand otherwise in each: the median one by "
+            f"{degrees:.1f} degrees and {shift:.0%} of the cameras' radius. Are they the same photos? {REMEDY}"
+        )
+    return Alignment(align(centers(poses), centers(fixed)), len(shared), degrees, shift)
+
+
+def stacked(views: list[View]) -> Float[np.ndarray, "C 4 4"]:
+    """The views' poses, cam_from_world."""
+    return np.concatenate([view.camera.viewmats.double().numpy() for view in views])
+
+
+def better_seen(
+    a: Gaussians, b: Gaussians, seen_a: Float[Tensor, "N"], seen_b: Float[Tensor, "M"]
+) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "M"]]:
+    """Splats that stay: in each cell those of the run whose input views see it and the cells around it more often.
+
+    `seen_a`, `seen_b`: input views of its own run that see a splat. The first run's stay in a draw. Splats of b that no
+    view sees do not stay.
+    """
+    means = torch.cat([a.means, b.means]).double()
+    opacities = torch.cat([a.opacities, b.opacities])
+    cells, rows = torch.unique(cells_of(means, means[opacities >= SOLID]), dim=0, return_inverse=True)
+    places = rows.split([len(a), len(b)])
+    views = []
+    for gaussians, place, seen in zip((a, b), places, (seen_a, seen_b), strict=True):
+        mass = masses(gaussians)
+        sums = torch.zeros(len(cells), 2, dtype=torch.float64)
+        sums = with_neighbors(cells, sums.index_add_(0, place, torch.stack([mass * seen, mass], dim=1)))
+        views.append(sums[:, 0] / sums[:, 1].clamp_min(1e-300))
+    second = views[1] > views[0] * (1 + TIE)
+    return ~second[places[0]], second[places[1]] & (seen_b > 0)
+
+
+def cells_of(means: Float[Tensor, "N 3"], solid: Float[Tensor, "S 3"]) -> Int[Tensor, "N 3"]:
+    """The cell in which each mean lies."""
+    points = solid if len(solid) else means
+    ordered = points.sort(dim=0).values
+    margin = int((1 - INNER_SHARE) / 2 * len(points))
+    low, high = ordered[margin], ordered[-1 - margin]
+    edge = max(float((high - low).max()) / CELLS, 1e-12)
+    return ((means - low) / edge).floor().clamp(-FARTHEST, FARTHEST).long()
+
+
+def with_neighbors(cells: Int[Tensor, "C 3"], sums: Float[Tensor, "C 2"]) -> Float[Tensor, "C 2"]:
+    """The sums of each cell and its 26 neighbors; the cells are different and in order."""
+    stride = torch.tensor([(4 * FARTHEST) ** 2, 4 * FARTHEST, 1])
+    keys, total = cells @ stride, torch.zeros_like(sums)
+    for step in torch.cartesian_prod(*[torch.tensor([-1, 0, 1])] * 3):
+        wanted = (cells + step) @ stride
+        row = torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)
+        total += torch.where((keys[row] == wanted)[:, None], sums[row], 0)
+    return total
+
+
+def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same splats with as many bands, the new ones 0."""
+    missing = (degree + 1) ** 2 - 1 - gaussians.shN.shape[1]
+    return replace(gaussians, shN=torch.nn.functional.pad(gaussians.shN, (0, 0, 0, missing)))
+
+
+def turned_degrees(similarity: Similarity) -> float:
+    """Angle of a similarity's rotation."""
+    return math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(similarity.rotation)) - 1) / 2))))
