@@ -38,7 +38,8 @@ class Flags:
     force: bool = False
     """Replace OUT if it exists."""
     decimate: str = "100%"
-    """Keep this share of the splats by merging neighbors, as 25%; a run prints what that costs its views."""
+    """Keep this share of the splats, as 25%: neighbors are merged, those that a run's input views hardly see left out.
+    A run prints what that costs its views."""
     strict: bool = False
     """Refuse a file with a splat that cannot be drawn (NaN, no rotation) instead of leaving that splat out."""
 
@@ -60,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     antialiased = is_antialiased(source)
     gaussians = load_splats(source, strict=flags.strict)
     if share < 1:
-        gaussians = merged(flags.source, gaussians, share)
+        gaussians = fewer(flags.source, gaussians, share)
     if suffix == PAGE:
         write_page(flags.source, gaussians, out, antialiased)
     else:
@@ -81,25 +82,24 @@ def share_of(text: str) -> float:
     return share
 
 
-def merged(source: Path, gaussians: Gaussians, share: float) -> Gaussians:
-    """Fewer splats; prints the PSNR of a run's views before and after."""
+def fewer(source: Path, gaussians: Gaussians, share: float) -> Gaussians:
+    """A share of the splats; prints the PSNR of a run's views before and after."""
     from gsopt.data.refined_poses import with_refined_poses
     from gsopt.data.scene import load_scene
-    from gsopt.results.clean import input_psnr
+    from gsopt.results.clean import input_psnr, observe
     from gsopt.results.decimate import decimated
     from gsopt.results.finished_run import open_run
 
-    fewer = decimated(gaussians, share)
-    if (source / "config.json").is_file():
-        run = open_run(source)
-        scene = with_refined_poses(load_scene(run.config.data), run.path)
-        for name, views in (("input", scene.train), ("held-out", scene.test)):
-            if views:
-                before, after = (input_psnr(run, splats, views[:MEASURED_VIEWS]) for splats in (gaussians, fewer))
-                print(
-                    f"{name} views: {before:.2f} dB, with {share:.0%} of the splats {after:.2f} ({after - before:+.2f})"
-                )
-    return fewer
+    if not (source / "config.json").is_file():
+        return decimated(gaussians, share)
+    run = open_run(source)
+    scene = with_refined_poses(load_scene(run.config.data), run.path)
+    left = decimated(gaussians, share, observe(gaussians, scene.train, run.backend).weight)
+    for name, views in (("input", scene.train), ("held-out", scene.test)):
+        if views:
+            before, after = (input_psnr(run, splats, views[:MEASURED_VIEWS]) for splats in (gaussians, left))
+            print(f"{name} views: {before:.2f} dB, with {share:.0%} of the splats {after:.2f} ({after - before:+.2f})")
+    return left
 
 
 def write_page(source: Path, gaussians: Gaussians, out: Path, antialiased: bool) -> None:

@@ -88,6 +88,20 @@ def test_the_command_prints_what_it_costs(tmp_path: Path, capsys: pytest.Capture
     assert len(load_splats(tmp_path / "b.spz")) == 3
 
 
+def test_what_views_hardly_see_goes_first() -> None:
+    """More of the splats that are seen stay as they are than without views, and fewer of those that are not."""
+    cloud = many(100)
+    seen = torch.where(torch.arange(100) < 60, 0.0, 50.0)
+    found = decimated(cloud, 0.4, seen)
+    assert len(found) == 40
+    unseen, seen_ones = ({tuple(row) for row in part.tolist()} for part in (cloud.means[:60], cloud.means[60:]))
+    left, without = ({tuple(row) for row in c.means.tolist()} for c in (found, decimated(cloud, 0.4)))
+    assert len(left & seen_ones) > len(without & seen_ones)
+    assert len(left & unseen) < len(without & unseen)
+    assert torch.equal(found.means, decimated(cloud, 0.4, seen).means)
+    assert len(decimated(cloud, 1e-6, torch.zeros(100))) == 1
+
+
 @pytest.mark.parametrize("text", ["0%", "-5%", "101%", "25", "x%", "nan%", ""])
 def test_a_share_that_is_none_is_refused_in_one_line(tmp_path: Path, capsys, text: str) -> None:
     assert main(["export", str(make_run(tmp_path)), "-o", str(tmp_path / "a.ply"), f"--decimate={text}"]) == 2
