@@ -18,9 +18,7 @@ from .core.units import meters_per_unit
 from .job_results import FINISH
 from .operator_errors import WaitingOperator
 from .operators_inspect import METERS, activate, data_of, frame
-from .operators_result import finished_run
-from .operators_source import begin, refuse_two
-from .preferences import python, work_folder
+from .operators_result import work_on_run
 
 PRODUCT = "mesh.ply"
 PROXY = "gsopt_proxy"
@@ -36,11 +34,7 @@ class GSOPT_OT_mesh_proxy(WaitingOperator, bpy.types.Operator):
     bl_label = "Mesh Proxy"
 
     def do(self, context: Any) -> str:
-        refuse_two(context, "mesh")
-        run = finished_run(context)
-        folder = job.free_folder(work_folder(context) / "jobs", "mesh")
-        call = arguments.mesh(python(context), run, run / PRODUCT)
-        return begin(context, self, job.start("mesh", call, folder, run / PRODUCT))
+        return work_on_run(context, self, PRODUCT, "mesh", arguments.mesh)
 
 
 def add_proxy(scene: Any, path: Path) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from .operator_errors import ReportingOperator, WaitingOperator
 from .operators_source import begin, refuse_two
 from .preferences import absolute, python, work_folder
 
-PAGE = "page.html"
+PAGE, PICTURE = "page.html", "clean.png"
 SPLATS, BEFORE = "splat.ply", "splat.before-clean.ply"
 METRICS_BEFORE = "metrics.before-clean.json"
 
@@ -27,6 +28,17 @@ def finished_run(context: Any) -> Path:
     return run
 
 
+def work_on_run(
+    context: Any, operator: WaitingOperator, product: str, kind: str, words: Callable[[Path, Path, Path], list[str]]
+) -> str:
+    """Start gsopt on the finished run; `words` makes the command of interpreter, run and the file to write."""
+    refuse_two(context, kind)
+    run = finished_run(context)
+    folder = job.free_folder(work_folder(context) / "jobs", kind)
+    call = words(python(context), run, run / product)
+    return begin(context, operator, job.start(kind, call, folder, run / product))
+
+
 class GSOPT_OT_share(WaitingOperator, bpy.types.Operator):
     """Write the run as one page that shows its splats in any browser, and open it"""
 
@@ -34,11 +46,7 @@ class GSOPT_OT_share(WaitingOperator, bpy.types.Operator):
     bl_label = "Share Page"
 
     def do(self, context: Any) -> str:
-        refuse_two(context, "page")
-        run = finished_run(context)
-        folder = job.free_folder(work_folder(context) / "jobs", "page")
-        call = arguments.page(python(context), run, run / PAGE)
-        return begin(context, self, job.start("page", call, folder, run / PAGE))
+        return work_on_run(context, self, PAGE, "page", arguments.page)
 
 
 class GSOPT_OT_clean(WaitingOperator, bpy.types.Operator):
@@ -48,12 +56,7 @@ class GSOPT_OT_clean(WaitingOperator, bpy.types.Operator):
     bl_label = "Clean"
 
     def do(self, context: Any) -> str:
-        refuse_two(context, "clean")
-        run = finished_run(context)
-        folder = job.free_folder(work_folder(context) / "jobs", "clean")
-        return begin(
-            context, self, job.start("clean", arguments.clean(python(context), run), folder, run / "clean.png")
-        )
+        return work_on_run(context, self, PICTURE, "clean", lambda python, run, _: arguments.clean(python, run))
 
 
 class GSOPT_OT_undo_clean(ReportingOperator, bpy.types.Operator):
