@@ -21,6 +21,7 @@ from gsopt.geometry.projection import project
 from gsopt.metrics import psnr
 from gsopt.raster.api import rasterize
 from gsopt.raster.backend import ALPHA_MIN, Backend, RasterSettings
+from gsopt.raster.threads import one_torch_thread
 from gsopt.results.finished_run import FinishedRun, draw, truth
 
 UNSEEN_WEIGHT = 0.005
@@ -64,6 +65,7 @@ class Finding:
     followed: bool
 
 
+@one_torch_thread()
 def observe(gaussians: Gaussians, views: Sequence[View], backend: Backend) -> Observation:
     """Weights of every splat in the input views."""
     n = len(gaussians)
@@ -96,6 +98,7 @@ def _weights(gaussians: Gaussians, view: View, backend: Backend) -> tuple[Tensor
     return weights[:, 0], weights[:, 1], project(camera, gaussians.means)[2] / nearest
 
 
+@one_torch_thread()
 def findings(run: FinishedRun, views: Sequence[View], box: tuple[float, ...] | None = None) -> list[Finding]:
     """Every rule and the splats it names, in the order in which they are followed; a splat is named once."""
     seen = observe(run.gaussians, views, run.backend)
@@ -135,6 +138,7 @@ def outside_box(gaussians: Gaussians, box: tuple[float, ...]) -> Bool[Tensor, "N
     return ((gaussians.means < low) | (gaussians.means > high)).any(dim=1)
 
 
+@one_torch_thread()
 def input_psnr(run: FinishedRun, gaussians: Gaussians, views: Sequence[View]) -> float:
     """Mean PSNR of the views, dB."""
     total = 0.0

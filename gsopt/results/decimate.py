@@ -16,6 +16,7 @@ from gsopt import check
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.morton import morton_order
 from gsopt.geometry.quats import from_rotation_matrices, normalize, rotation_matrices
+from gsopt.raster.threads import one_torch_thread
 
 MOST_MERGED = 0.2
 """Share of the splats that a round may take away: the others find better partners in the next."""
@@ -27,6 +28,7 @@ MAX_OPACITY = 0.995
 _SMALLEST = 1e-14
 
 
+@one_torch_thread()
 def decimated(gaussians: Gaussians, share: float, contributions: Float[Tensor, "N"] | None = None) -> Gaussians:
     """About `share` of the splats (at least one). The same input gives the same bits.
 

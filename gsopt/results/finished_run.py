@@ -21,6 +21,7 @@ from gsopt.geometry.camera_paths import ellipse_path, interpolated_path, orbit_p
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.raster.threads import one_torch_thread
 from gsopt.results.camera_path_file import read_camera_path
 from gsopt.results.video import safe_name, save_stills, save_video
 
@@ -89,6 +90,7 @@ def background_of(run: Path) -> Float[Tensor, "3"]:
     return torch.tensor([files.number(value, where) for value in color]).clamp(0, 1)
 
 
+@one_torch_thread()
 def draw(
     gaussians: Gaussians, camera: Cameras, backend: Backend, settings: RasterSettings, background: Float[Tensor, "3"]
 ) -> UInt8[Tensor, "H W 3"]:

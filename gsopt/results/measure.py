@@ -19,6 +19,7 @@ from gsopt.data.scene import View, load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import to_json, write_atomic
 from gsopt.formats.units import Units, read_units, units_from_notes
+from gsopt.raster.threads import one_torch_thread
 from gsopt.results.finished_run import FinishedRun
 from gsopt.results.mesh.median_depth import depth_view
 
@@ -68,6 +69,7 @@ def located(run: FinishedRun, text: str) -> Float[Tensor, "3"]:
     )
 
 
+@one_torch_thread()
 def lifted(run: FinishedRun, view: View, column: float, row: float) -> Float[Tensor, "3"]:
     """The surface point (median depth) that a pixel of a view shows."""
     camera = view.camera

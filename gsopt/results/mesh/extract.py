@@ -24,6 +24,7 @@ from gsopt.geometry.focus import Focus, find_focus
 from gsopt.geometry.projection import project
 from gsopt.init.hull import carve
 from gsopt.init.thumbnails import Thumbnail, small_photos
+from gsopt.raster.threads import one_torch_thread
 from gsopt.results.finished_run import FinishedRun, open_run, with_longest_side
 from gsopt.results.mesh import surface
 from gsopt.results.mesh.fusion import Box, box_around, fused, truncation
@@ -47,6 +48,7 @@ Corners = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
 """Lowest and highest coordinates."""
 
 
+@one_torch_thread()
 def extract_mesh(
     run: str | PathLike[str] | FinishedRun,
     *,
