@@ -54,10 +54,19 @@ fuzz: $(VENV)/.for-test
 	$(PIP) atheris
 	$(PY) tests/fuzz/campaign.py $(SECONDS)
 
-# Random changes of the code, COUNT of them, one at a time: does a test notice?
+# Random changes of the code, COUNT of them, one at a time: does a test notice? Goes on where it was cut; remove build/mutants
+# when the code has changed.
 COUNT ?= 60
-mutants: $(VENV)/.for-test
-	$(PY) tests/mutants/mutate.py --count $(COUNT) --json experiments/results/mutants.json
+SEED ?= 0
+MUTANTS := build/mutants
+mutants: $(MUTANTS)/junit.xml
+	$(PY) tests/mutants/mutate.py --count $(COUNT) --seed $(SEED) --traces $(MUTANTS) --json $(MUTANTS)/$(SEED).json
+
+# Which test ran which line.
+$(MUTANTS)/junit.xml: $(VENV)/.for-test
+	$(PIP) pytest-cov
+	OMP_NUM_THREADS=1 COVERAGE_FILE=$(MUTANTS)/coverage $(PY) -m pytest --cov gsopt --cov blender_addon --cov-context=test --cov-report= \
+	  --junitxml=$@ $$($(PY) tests/mutants/mutate.py --print-tests)
 
 # Wheels in dist/ that need no compiler to install. PYTHON312: any Python from 3.12 on.
 PYTHON312 ?= python3.12

@@ -6,23 +6,90 @@ Every job runs in a fork, so that torch is imported once. LD_PRELOAD names the c
 from __future__ import annotations
 
 import ctypes
+import importlib
 import json
 import os
 import signal
 import sys
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn, Self
 
 import torch
 
 import gsopt.cli.train  # noqa: F401 (jobs would import it anew)
 from gsopt.cli import main
+from gsopt.config.train import InitConfig, SparseConfig, TrainConfig
+from gsopt.data.sfm import child_process
 from gsopt.finetune import evaluation, reconstruction_pairs
+from gsopt.sds.priors import view_conditioned
 
-reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2  # how much a prior learns is not what is tested
+FEW = TrainConfig(
+    init=InitConfig(method="random", count=60),
+    sparse=SparseConfig(symmetry="off"),
+    checkpoint_every=0,
+    preview_every=0,
+)
+SMALLER = (
+    (reconstruction_pairs, "reconstruction_config", lambda length, seed: replace(FEW.with_steps(6), seed=seed)),
+    (reconstruction_pairs, "HELD_OUT_VIEWS", 1),
+    (evaluation, "MAX_RENDERS", 1),
+    (evaluation, "NOISE_STEPS_EVALUATED", (500,)),
+    (view_conditioned, "UNET_WIDTHS", (16, 16, 16)),
+)
+"""Makes the training of a prior small: how much it learns is not what is tested."""
+
+
+class ForkedChild:
+    """Takes the place of Popen for the child of `gsopt sfm`: a fork, so that COLMAP is imported once."""
+
+    def __init__(self, command: list[str], stderr: IO[bytes], **_: Any) -> None:
+        (stdin, self.stdin), (self.stdout, stdout) = (
+            (os.fdopen(end, mode, encoding="utf-8") for end, mode in zip(os.pipe(), "rw", strict=True)) for _ in "io"
+        )
+        self.pid = os.fork()
+        if self.pid == 0:
+            self.stdin.close()
+            for file, number in ((stdin, 0), (stdout, 1), (stderr, 2)):
+                os.dup2(file.fileno(), number)
+            sys.argv, sys.stdin = command[2:], stdin
+            child_process.main()
+            os._exit(1)
+        stdin.close()
+        stdout.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stdin.close()
+        self.stdout.close()
+
+    def wait(self) -> int:
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+    def kill(self) -> None:
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
 
 KINDS = ("none", "kill", "fail once", "fail from here", "short")
 LONGEST_SECONDS = 120
+FULL = os.environ.get("GSOPT_EVERY_WRITE") == "full"
+
+
+def prepare() -> None:
+    """Does once what every job would do again."""
+    torch.set_num_threads(1)
+    for module, name, value in SMALLER:
+        assert hasattr(module, name), f"{module.__name__} has no {name}"
+        setattr(module, name, value)
+    if FULL:
+        view_conditioned.make_unet(0)  # imports diffusers, for seconds
+        importlib.import_module("gsopt.data.sfm.pipeline")
+        importlib.import_module("pycolmap")
+        child_process.subprocess.Popen = ForkedChild
 
 
 def run(job: dict[str, Any], faults: ctypes.CDLL) -> NoReturn:
@@ -39,7 +106,7 @@ def run(job: dict[str, Any], faults: ctypes.CDLL) -> NoReturn:
 def serve() -> None:
     faults = ctypes.CDLL(os.environ["LD_PRELOAD"])
     faults.faults_calls.restype = ctypes.c_long
-    torch.set_num_threads(1)
+    prepare()
     for line in sys.stdin:
         job = json.loads(line)
         Path(job["folder"]).mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
 """Changes one place of the code at a time, at random, and looks whether a test notices: python mutate.py [options].
 
-The changes are chosen by the seed alone, nobody picks them. The tests of a module are those that mirror its folder.
-Survivors are printed with their line: a law is missing, or the change is harmless.
+The changes are chosen by the seed alone, nobody picks them. The tests of a module are those that mirror its folder;
+with `--traces` (see `make mutants`), those of their files that run the line, the quick ones first. Survivors are
+printed with their line: a law is missing, or the change is harmless. A campaign that was cut goes on from its `--json`.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = {
@@ -50,6 +54,8 @@ SWAPS: dict[type, str] = {
 }
 CALLS = {"min": "max", "max": "min", "any": "all", "all": "any"}
 LONGEST_SECONDS = 900
+NO_TESTS = 5
+"""pytest's exit code."""
 
 
 @dataclass(frozen=True)
@@ -160,20 +166,55 @@ def tests_of(file: str) -> list[str]:
     return [*named, *folders]
 
 
-def noticed(mutant: Mutant, copy: Path) -> bool:
-    """True when a test fails, or does not end, on a copy of the tree with this change."""
+class Traces:
+    """Which files of tests ran which line, and for how long: pytest-cov's data, and pytest's report beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        from coverage import CoverageData
+
+        self._data = CoverageData(str(folder / "coverage"))
+        self._data.read()
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+        for case in ElementTree.parse(folder / "junit.xml").iter("testcase"):
+            words = case.attrib["classname"].split(".")
+            self._seconds["/".join(words) + ".py"] += float(case.attrib["time"])
+
+    def tests_of(self, mutant: Mutant) -> list[str]:
+        """The files of the module's tests that ran its line; where none did, as on import, those that ran any."""
+        contexts = next(
+            (self._contexts(file) for file in self._data.measured_files() if file.endswith(mutant.file)), {}
+        )
+        places = tests_of(mutant.file)
+        here = self._among(contexts.get(mutant.line, []), places)
+        return here or self._among([test for tests in contexts.values() for test in tests], places) or places
+
+    def _contexts(self, file: str) -> dict[int, list[str]]:
+        return self._data.contexts_by_lineno(file)
+
+    def _among(self, contexts: list[str], places: list[str]) -> list[str]:
+        files = {context.partition("::")[0] for context in contexts}
+        return sorted((file for file in files if file.startswith(tuple(places))), key=lambda file: self._seconds[file])
+
+
+def noticed_by(mutant: Mutant, tests: list[str], copy: Path) -> str:
+    """The test that fails, or the time limit, on a copy of the tree with this change; empty when all tests pass."""
     path = copy / mutant.file
     whole = path.read_bytes()
     path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests_of(mutant.file)]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
     env = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        done = subprocess.run(command, cwd=copy, env=env, capture_output=True, timeout=LONGEST_SECONDS, check=False)
+        done = subprocess.run(
+            command, cwd=copy, env=env, capture_output=True, text=True, timeout=LONGEST_SECONDS, check=False
+        )
     except subprocess.TimeoutExpired:
-        return True
+        return f"{LONGEST_SECONDS} s"
     finally:
         path.write_bytes(whole)
-    return done.returncode != 0
+    if done.returncode == NO_TESTS:
+        sys.exit(f"no tests in {' '.join(tests)}")
+    named = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return "" if done.returncode == 0 else [*named, "import"][0]
 
 
 def main() -> None:
@@ -181,23 +222,49 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60, help="number of changes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--since", default="", help="only modules that differ from this commit")
-    parser.add_argument("--json", type=Path, help="file for the outcome of every change")
+    parser.add_argument("--json", type=Path, help="file for the outcome of every change; what it has is not done again")
+    parser.add_argument("--traces", type=Path, help="folder with the coverage and junit.xml of the tests")
+    parser.add_argument("--print-tests", action="store_true", help="print the folders of all tests, and end")
     options = parser.parse_args()
+    if options.print_tests:
+        print(*dict.fromkeys(" ".join(FOLDERS.values()).split()))
+        return
     files = changed_since(options.since) if options.since else sorted(ROOT.rglob("*.py"))
     mutants = [m for file in files if tests_of(str(file.relative_to(ROOT))) for m in mutants_of(file)]
     chosen = random.Random(options.seed).sample(mutants, min(options.count, len(mutants)))
-    outcomes, began = [], time.monotonic()
+    outcomes, tests_for = resumed(options.json, options.seed), tests_of_file
+    if options.traces:
+        tests_for = Traces(options.traces).tests_of
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "build", "dist", "runs"))
         for mutant in chosen:
-            outcomes.append({**asdict(mutant), "noticed": noticed(mutant, copy)})
-            if not outcomes[-1]["noticed"]:
+            known = next((outcome for outcome in outcomes if asdict(mutant).items() <= outcome.items()), None)
+            if known is None:
+                began = time.monotonic()
+                found = noticed_by(mutant, tests_for(mutant), copy)
+                known = {**asdict(mutant), "noticed_by": found, "seconds": round(time.monotonic() - began, 1)}
+                outcomes.append(known)
+                if options.json:
+                    options.json.write_text(json.dumps({"seed": options.seed, "outcomes": outcomes}, indent=1) + "\n")
+            if not known["noticed_by"]:
                 print(f"{mutant.file}:{mutant.line}: {mutant.old!r} became {mutant.new!r}: no test noticed", flush=True)
-    found = sum(bool(outcome["noticed"]) for outcome in outcomes)
-    print(f"{found} of {len(outcomes)} noticed, of {len(mutants)} possible, {time.monotonic() - began:.0f} s")
-    if options.json:
-        options.json.write_text(json.dumps({"seed": options.seed, "outcomes": outcomes}, indent=1) + "\n")
+    count = sum(bool(outcome["noticed_by"]) for outcome in outcomes)
+    seconds = sum(outcome["seconds"] for outcome in outcomes)
+    print(f"{count} of {len(outcomes)} noticed, of {len(mutants)} possible, {seconds:.0f} s")
+
+
+def tests_of_file(mutant: Mutant) -> list[str]:
+    """All tests of the module."""
+    return tests_of(mutant.file)
+
+
+def resumed(path: Path | None, seed: int) -> list[dict[str, Any]]:
+    """The outcomes of a campaign that was cut."""
+    if path is None or not path.exists():
+        return []
+    record = json.loads(path.read_text())
+    return list(record["outcomes"]) if record["seed"] == seed else []
 
 
 if __name__ == "__main__":
