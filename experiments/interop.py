@@ -119,7 +119,8 @@ def main() -> int:
     flags = parser.parse_args()
     run = open_run(flags.run)
     records = measured(run, flags.splat_transform)
-    version = subprocess.run([flags.splat_transform, "--version"], capture_output=True, text=True, check=True).stdout
+    asked = subprocess.run([flags.splat_transform, "--version"], capture_output=True, text=True, check=True)
+    version = asked.stdout + asked.stderr
     for record in records:
         print(f"{record['format']:>15}  {record['way']:>9}  {record['psnr']:6.2f} dB  {record['bytes']:>10,} bytes")
     low = [record for record in records if record["psnr"] < FLOORS[record["format"]] or record["left_out"]]

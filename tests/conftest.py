@@ -41,6 +41,12 @@ def embedded(monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.fixture
+def coarse_hull(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hulls of an eighth of the voxels, for tests of something else: a hull takes seconds."""
+    monkeypatch.setattr("gsopt.init.hull._MAX_SIDE", 56)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real captures and meshes that may not ship with the project; tests that need them skip where they are absent."""

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 from test_mask_agreement import SIZE, photos
@@ -17,6 +18,8 @@ from gsopt.data.scene import Scene, load_scene
 from gsopt.init import first_gaussians
 from gsopt.init.mask_repair import load_with_agreeing_masks
 from gsopt.training.loop import train
+
+pytestmark = pytest.mark.usefixtures("coarse_hull")
 
 COUNT = 5
 CUT = 1

@@ -23,6 +23,8 @@ from gsopt.init.cut_out import RECORD, cut_out, with_made_masks
 from gsopt.init.object_box import box_around, box_of_points, object_points, overlap
 from gsopt.init.thumbnails import small_photos
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 MODEL = SHARED / "weights" / "u2netp.onnx"
 HEAD = SHARED / "views" / "ethiopianHead_800" / "images"

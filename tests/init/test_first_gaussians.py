@@ -20,6 +20,8 @@ from gsopt.init import first_gaussians
 from gsopt.init.frustum import random_points
 from gsopt.init.neighbors import mean_neighbor_distance
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:

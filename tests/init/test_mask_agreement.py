@@ -19,6 +19,8 @@ from gsopt.init.mask_parts import cleaned, labels
 from gsopt.init.mask_repair import load_with_agreeing_masks
 from gsopt.init.thumbnails import small_photos
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 BALLS = [Ball((0.0, 0, 0), 0.5), Ball((0.3, 0.1, 0.45), 0.25), Ball((-0.35, -0.2, -0.2), 0.3)]
 SIZE = 96
 WRONG = 2

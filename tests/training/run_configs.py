@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from PIL import Image
 from tiny_scenes import tiny_config
 
@@ -19,6 +21,11 @@ from gsopt.config.train import (
     ScheduleConfig,
     SparseConfig,
     TrainConfig,
+)
+
+HANGUP = pytest.param(
+    signal.SIGHUP,
+    marks=pytest.mark.skipif(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN, reason="under nohup it is ignored"),
 )
 
 

@@ -18,6 +18,8 @@ from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.training.few_photos import GUESSED, TURNED, few_photo_warnings
 from gsopt.training.loop import train
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 THING = [Ball((0.1, 0.0, 0.0), 0.5), Ball((-0.4, 0.2, 0.3), 0.2, (40, 90, 220))]
 TWO_THINGS = [Ball((0.6, 0.5, 0.0), 0.25), Ball((-0.5, -0.6, 0.1), 0.25)]
 EYES = [(3.5, 0.5, 1.5), (0.5, 3.5, 1.2), (-3.0, -2.0, 1.0)]

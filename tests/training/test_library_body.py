@@ -23,6 +23,8 @@ from gsopt.training.library_body import expert_texts, require_library
 from gsopt.training.loop import train
 from gsopt.training.reconstruct import reconstruct
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 SPARSE = SparseConfig(steps_per_view=0, symmetry="off")
 BALL = [Ball((0.0, 0.0, 0.0), 0.6, (200, 60, 30))]
 

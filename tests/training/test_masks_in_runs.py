@@ -17,6 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "init"))
 from test_cut_out import BrownIsTheObject
 from test_mask_agreement import WRONG, photos
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 
 def short(data: str, **changes: object) -> TrainConfig:
     settings = {"path": data, **changes}

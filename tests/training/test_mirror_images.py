@@ -29,6 +29,8 @@ from gsopt.training.guided.guard import without
 from gsopt.training.loop import train
 from gsopt.training.targets import Targets
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 X = Mirror(torch.tensor([1.0, 0, 0]), 0.0)
 HALF = [
     Ball((0.15, 0.0, 0.0), 0.5, (150, 150, 150)),

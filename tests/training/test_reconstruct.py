@@ -9,6 +9,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from run_configs import HANGUP
 from tiny_scenes import write_dataset
 
 import gsopt
@@ -103,7 +104,7 @@ def test_events_count_the_views_that_were_evaluated(data: Path, tmp_path: Path) 
     assert last["views"] == last["total"] == len(read_metrics(tmp_path / "run")["per_view"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, HANGUP, signal.SIGINT])
 @pytest.mark.parametrize("moment", ["gsopt.training.reconstruct.evaluate", "gsopt.training.loop._finish"])
 def test_a_run_that_is_stopped_while_it_is_evaluated_ends_as_stopped_and_resumes(
     moment: str, number: signal.Signals, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import torch
-from run_configs import configs
+from run_configs import HANGUP, configs
 from tiny_scenes import tiny_config
 
 from gsopt.config.train import TrainConfig
@@ -269,7 +269,7 @@ def test_other_settings_are_refused_on_resume_but_threads_may_change(dataset: Pa
     train(replace(config, threads=3, preview_every=0), run, resume=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, HANGUP])
 def test_a_signal_lets_the_step_finish_and_saves(
     number: signal.Signals, dataset: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,6 +26,8 @@ from tiny_prior import untrained, write_prior
 
 sys.path.pop(0)
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 SPARSE = SparseConfig(steps_per_view=0, symmetry="off")
 BALL = [Ball((0.0, 0.0, 0.0), 0.6, (200, 60, 30))]
 

@@ -19,6 +19,8 @@ from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.loop import TrainResult, train
 from gsopt.training.plan import RunPlan
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 BALL = [Ball((0.1, 0.0, 0.0), 0.6, (200, 60, 30)), Ball((-0.5, 0.2, 0.3), 0.25, (200, 60, 30))]
 
 
