@@ -17,11 +17,13 @@ def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str)
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that share a fixture of their module go to one worker (`--dist loadgroup`): it is built once, not twice."""
+    """Tests that share a fixture of their module go to one worker (`--dist loadgroup`): it is built once, not twice.
+    They come first, so that no worker is left with a long one at the end."""
     for item in items:
         known = item._fixtureinfo.name2fixturedefs if isinstance(item, pytest.Function) else {}
         if any(found.scope == "module" for defs in known.values() for found in defs[-1:]):
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -16,6 +16,8 @@ from gsopt.init.hull import carve
 from gsopt.init.rounded_hull import FAR_SQUARED, RADIUS_RATIO, rounded, squared_distance, thickest, thickness
 from gsopt.init.thumbnails import Thumbnail, small_photos
 
+pytestmark = pytest.mark.usefixtures("coarse_hull")
+
 CENTER = (0.3, -0.2, 0.1)
 
 
