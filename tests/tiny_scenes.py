@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from gsopt.config.guidance import GuidanceConfig
-from gsopt.config.train import DataConfig, DensityConfig, InitConfig, TrainConfig
+from gsopt.config.train import DataConfig, DensityConfig, InitConfig, SparseConfig, TrainConfig
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at, opengl_from_viewmats
 from gsopt.raster.api import make_backend
@@ -72,6 +72,7 @@ def tiny_config(dataset: Path, **changes: object) -> TrainConfig:
         "density": DensityConfig(refine_start=4, refine_every=5, refine_stop=25, grow_grad2d=5e-5, max_gaussians=90),
         "iterations": 30,
         "guidance": GuidanceConfig(lambda_sds=0.0),
+        "sparse": SparseConfig(symmetry="off"),  # the search takes longer than the run
         "backend": "cpu",
         "checkpoint_every": 10,
         "preview_every": 15,

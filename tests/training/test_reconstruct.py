@@ -7,6 +7,7 @@ import json
 import shutil
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from run_configs import HANGUP
@@ -19,8 +20,13 @@ from gsopt.errors import GsoptError, InputError, SettingError, UsageError
 from gsopt.events import read_events
 from gsopt.results.evaluation import read_metrics
 
-SHORT = {"iterations": 4, "init": {"method": "random", "count": 20}, "guidance": {"lambda_sds": 0.0}}
-FLAGS = "--iterations 4 --init random --init-count 20 --lambda_sds 0 --views 2"
+SHORT: dict[str, Any] = {
+    "iterations": 4,
+    "init": {"method": "random", "count": 20},
+    "guidance": {"lambda_sds": 0.0},
+    "sparse": {"symmetry": "off"},
+}
+FLAGS = "--iterations 4 --init random --init-count 20 --lambda_sds 0 --views 2 --sparse.symmetry off"
 
 
 @pytest.fixture
