@@ -14,8 +14,9 @@ import torch
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.errors import InputError
-from gsopt.events import Report, to_json, write_atomic
+from gsopt.events import Report
 from gsopt.finetune.caption_tokens import SceneCaptions, encode_captions
+from gsopt.finetune.claimed_folder import claim
 from gsopt.finetune.evaluation import evaluate, sample_sheet
 from gsopt.finetune.folder import write_folder
 from gsopt.finetune.pair_cache import PairCache, collect_pairs
@@ -34,7 +35,6 @@ from gsopt.sds.priors.view_conditioned import (
     zero_text_attention,
 )
 from gsopt.sds.select_prior import EMBEDDED
-from gsopt.training.run_directory import sweep
 
 SHEET_EVERY = 500
 """Steps between two sample sheets."""
@@ -61,7 +61,6 @@ def finetune(
     that holds something else.
     """
     _claim_folder(out, scenes, config, base)
-    sweep(out, *(path for path in out.iterdir() if path.is_dir() and not path.is_symlink()))
     train, val = (_library(paths, scenes, out / "pairs", backend, report) for paths in (scenes.train, scenes.val))
     assert train is not None
     held = 0 if val is None else len(val.pairs)
@@ -90,7 +89,6 @@ def finetune(
 
 def _claim_folder(out: Path, scenes: TrainingScenes, config: PriorTrainingConfig, base: Path | None) -> None:
     """Writes the training plan to `out`; raises InputError when `out` belongs to another one."""
-    path = out / "finetune.json"
     plan = {
         "course": asdict(config),
         "fits": scenes.reconstructions,
@@ -100,14 +98,7 @@ def _claim_folder(out: Path, scenes: TrainingScenes, config: PriorTrainingConfig
         "val": [scene.name for scene in scenes.val],
         "base": None if base is None else base.name,
     }
-    if path.exists():
-        if read_json(path) != json.loads(to_json(plan)):
-            raise InputError(f"{out} belongs to a training with other scenes or flags. Repeat them or give another -o.")
-        return
-    if out.exists() and any(entry.name != "pairs" for entry in out.iterdir()):
-        raise InputError(f"{out} is not empty and holds no training of a prior. Give another -o.")
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, to_json(plan))
+    claim(out / "finetune.json", plan, "a prior", "other scenes", beside="pairs")
 
 
 def _library(

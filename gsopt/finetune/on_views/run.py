@@ -15,6 +15,7 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
+from gsopt.finetune.claimed_folder import claim
 from gsopt.finetune.on_views.batches import LATENTS, make_examples
 from gsopt.finetune.on_views.folder import write_folder
 from gsopt.finetune.on_views.images import TrainingImage
@@ -126,19 +127,7 @@ def claim_folder(
         "images": asdict(preparation),
         "base": base,
     }
-    path = out / PLAN
-    if path.exists():
-        found = {key: value for key, value in read_json(path).items() if key != "measured"}
-        if found != json.loads(to_json(plan)):
-            raise InputError(f"{out} belongs to a training with other images or flags. Repeat them or give another -o.")
-        return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} is not empty and holds no training of this kind. Give another -o.")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"Cannot make {out}: {error.strerror or error}. Give another -o.") from error
-    write_atomic(path, to_json(plan))
+    claim(out / PLAN, plan, "this kind", "other images")
 
 
 class Log:

@@ -13,8 +13,9 @@ from typing import Any
 import torch
 
 from gsopt.data.files import read_json
-from gsopt.errors import InputError, UsageError
-from gsopt.events import Report, to_json, write_atomic
+from gsopt.errors import UsageError
+from gsopt.events import Report, write_atomic
+from gsopt.finetune.claimed_folder import claim
 from gsopt.finetune.shapes.evaluation import evaluate
 from gsopt.finetune.shapes.samples import word_rows
 from gsopt.finetune.shapes.trainer import ShapeTrainer
@@ -102,20 +103,12 @@ def finetune_shapes(
 
 def _claim_folder(out: Path, training: ShapeTraining) -> None:
     """Writes the plan to `out`; raises InputError when `out` belongs to another one."""
-    path = out / "finetune.json"
     plan = {
         "course": asdict(training.config),
         "entries": [entry.id for entry in training.library.entries],
         "held": list(training.held),
     }
-    if path.exists():
-        if read_json(path) != json.loads(to_json(plan)):
-            raise InputError(f"{out} belongs to a training with another library or flags. Repeat them or change -o.")
-        return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} is not empty and holds no training of a shape prior. Give another -o.")
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, to_json(plan))
+    claim(out / "finetune.json", plan, "a shape prior", "another library")
 
 
 def model_card(training: ShapeTraining, measured: Mapping[str, Any], parameters: int) -> str:
