@@ -15,8 +15,8 @@ _PIECE = 1 << 16
 _GZIP_WINDOW = 16 + zlib.MAX_WBITS
 _ALWAYS_ALLOWED = 1 << 23
 """Bytes that any file may decode to (8 MiB, 150,000 splats without view-dependent color)."""
-_MAX_RATIO = 100
-"""Beyond 8 MiB, a file may decode to this many times its size; real splats reach about 20."""
+_MAX_RATIO = 50
+"""Beyond 8 MiB, a file may decode to this many times its size; runs reach 15, a grid of equal splats 40."""
 
 
 def check_budget(decoded: int, packed: int, path: Path) -> None:

@@ -19,8 +19,8 @@ MAGIC = b"glTF"
 JSON, BINARY = b"JSON", b"BIN\0"
 HEADER = struct.Struct("<4sII")
 CHUNK = struct.Struct("<I4s")
-_MAX_JSON = 1 << 22
-"""Bytes. A file of splats alone has about 10 kB."""
+_MAX_JSON = 1 << 20
+"""Bytes. A file of splats alone has about 10 kB. Parsed JSON takes up to 25 times its text."""
 
 
 @dataclass(frozen=True)

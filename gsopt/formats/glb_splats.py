@@ -36,6 +36,11 @@ class Accessor:
     kind: np.dtype
     normalized: bool
 
+    @property
+    def size(self) -> int:
+        """Bytes of all elements, without what lies between them."""
+        return self.count * self.components * self.kind.itemsize
+
     def read(self, file: BinaryIO, document: Document) -> NDArray[np.float32]:
         """Values [count, components] as float32, normalized integers mapped to [0, 1] or [-1, 1]."""
         element = self.components * self.kind.itemsize
@@ -63,7 +68,7 @@ def splat_primitives(document: Document) -> list[Primitive]:
     unknown = sorted(set(document.names("extensionsRequired")) - _UNDERSTOOD)
     if unknown:
         document.fail(f"needs extensions that gsopt does not know: {', '.join(unknown)[:80]}")
-    found = []
+    found, claimed = [], 0
     placements = mesh_placements(document)
     for mesh, description in enumerate(document.objects(document.root, "meshes")):
         for primitive in document.objects(description, "primitives"):
@@ -71,13 +76,14 @@ def splat_primitives(document: Document) -> list[Primitive]:
                 linear = _linear_color(document, document.object(document.object(primitive, "extensions"), EXTENSION))
                 attributes = document.object(primitive, "attributes")
                 accessors = {name: _accessor(document, attributes, name) for name in attributes if _wanted(name)}
+                claimed += sum(accessor.size for accessor in accessors.values())
                 found += [Primitive(accessors, linear, place) for place in placements.get(mesh, [UNMOVED])]
     if not found:
         document.fail(f"has no primitive with {EXTENSION}, so it holds no splats")
-    # Every splat has its own 12 bytes of position: primitives that share them would multiply what a small file takes.
+    # Attributes that share their bytes, and many nodes with one mesh, would multiply what a small file takes.
     counts = (part.attributes["POSITION"].count for part in found if "POSITION" in part.attributes)
-    if 12 * sum(counts) > document.length:
-        document.fail("its primitives share their positions")
+    if claimed > document.length or 12 * sum(counts) > document.length:
+        document.fail("its primitives share their bytes")
     return found
 
 

@@ -24,7 +24,7 @@ from gsopt.formats.files import opened, replacing
 from gsopt.formats.glb_container import BINARY, CHUNK, HEADER, JSON, MAGIC, Document, read_container
 from gsopt.formats.glb_splats import EXTENSION, Accessor, Primitive, splat_primitives
 from gsopt.formats.linear_color import linear_from_srgb, srgb_from_linear_color
-from gsopt.formats.placement import placed
+from gsopt.formats.placement import joined, placed
 from gsopt.formats.units import UNKNOWN, Units
 from gsopt.formats.validation import MAX_SH_DEGREE, log_scales, logit, scales, storable
 from gsopt.gaussians import Gaussians
@@ -125,10 +125,7 @@ def load_glb(path: Path) -> Gaussians:
     with opened(path) as (file, size):
         document = read_container(file, size, path)
         parts = [_read_primitive(file, primitive, document) for primitive in splat_primitives(document)]
-    degree = max(part.sh_degree for part in parts)
-    parts = [part.with_sh_degree(degree) for part in parts]
-    joined = Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name, _ in parts[0].items()})
-    return with_flipped_axes(joined, LEFT_UP_FORWARD)
+    return with_flipped_axes(joined(parts), LEFT_UP_FORWARD)
 
 
 def _read_primitive(file: BinaryIO, primitive: Primitive, document: Document) -> Gaussians:

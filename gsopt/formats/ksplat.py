@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gsopt.errors import InputError
 from gsopt.formats.files import opened, read_exactly
+from gsopt.formats.placement import joined
 from gsopt.formats.validation import BANDS, BYTE_OPACITY_MARGIN, log_scales, logit
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
@@ -78,9 +79,8 @@ def load_ksplat(path: Path) -> Gaussians:
     filled = [part for part in parts if len(part)]
     if not filled:
         raise InputError(f"{path} holds no splats. Export it again.")
-    degree = max(part.sh_degree for part in filled)
-    filled = [part.with_sh_degree(degree) for part in filled]
-    return Gaussians(**{name: torch.cat([getattr(part, name) for part in filled]) for name, _ in filled[0].items()})
+    parts.clear()
+    return joined(filled)
 
 
 def _section(data: bytes, number: int, path: Path) -> _Section:

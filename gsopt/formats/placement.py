@@ -1,4 +1,4 @@
-"""Splats under a similarity: turned or mirrored, scaled alike in all axes, moved."""
+"""Splats under a similarity: turned or mirrored, scaled alike in all axes, moved; and parts of a file put together."""
 
 from __future__ import annotations
 
@@ -40,3 +40,23 @@ def placed(
         log_scales=gaussians.log_scales + torch.tensor(scale).log().to(gaussians.log_scales),
         shN=sh.turned(gaussians.shN, axes),
     )
+
+
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """All splats of one or more parts, with the bands of the highest degree among them; empties the list."""
+    if len(parts) == 1:
+        return parts.pop()
+    count, bands = sum(map(len, parts)), max(part.shN.shape[1] for part in parts)
+    whole = Gaussians(
+        **{name: torch.empty(count, *tensor.shape[1:]) for name, tensor in parts[0].items() if name != "shN"},
+        shN=torch.zeros(count, bands, 3),
+    )
+    end = count
+    while parts:
+        part = parts.pop()
+        begin = end - len(part)
+        for name, tensor in part.items():
+            rows = getattr(whole, name)[begin:end]
+            (rows[:, : tensor.shape[1]] if name == "shN" else rows).copy_(tensor)
+        end = begin
+    return whole

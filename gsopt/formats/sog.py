@@ -30,7 +30,10 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.morton import morton_order
 
 META = "meta.json"
-_MAX_META = 1 << 20
+_MAX_META = 1 << 17
+"""Bytes; a meta.json has about 12 kB. Parsed JSON takes up to 25 times its text."""
+_SPARE_PIXELS = 1 << 14
+"""Pixels that an image may have beyond twice the number of splats; encoders fill their last row."""
 _MAX_SPLATS = 1 << 28
 _ENTRIES = 256
 _ROW_PIXELS = 64
@@ -162,7 +165,8 @@ class _Bundle:
         try:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
                 width, height = image.size
-                if (width, height) != size if size else width * height < self._count:
+                fits = self._count <= width * height <= 2 * self._count + _SPARE_PIXELS
+                if (width, height) != size if size else not fits:
                     self._fail(f"{shortened(name)} has {width} x {height} pixels for {self._count} splats")
                 check_budget(4 * width * height, self._size, self._path)
                 return np.asarray(image.convert("RGBA"))
