@@ -19,7 +19,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.projection import project
 from gsopt.metrics import psnr
-from gsopt.raster.api import rasterize
+from gsopt.raster.api import Rendering, rasterize
 from gsopt.raster.backend import ALPHA_MIN, Backend, RasterSettings
 from gsopt.raster.threads import one_torch_thread
 from gsopt.results.finished_run import FinishedRun, draw, truth
@@ -79,23 +79,27 @@ def observe(gaussians: Gaussians, views: Sequence[View], backend: Backend) -> Ob
 
 def _weights(gaussians: Gaussians, view: View, backend: Backend) -> tuple[Tensor, Tensor, Tensor]:
     """(weight, weight outside the mask, depth as a share of the nearest surfaces') of each splat in one view."""
-    camera = view.camera.to(torch.float32)
-    colors = torch.zeros(len(gaussians), 1, 3, device=backend.device, requires_grad=True)
-    shapes = replace(gaussians, shN=gaussians.shN[:, :0].contiguous()).to(backend.device)
-    painted = replace(shapes, sh0=colors)
-    drawn = rasterize(painted, camera, PLAIN, backend=backend, depth=True)
-    pixels = torch.zeros_like(drawn.colors)
-    pixels[..., 0] = 1
     image = view.pixels()
-    if image.shape[2] == 4:
-        pixels[0, ..., 1] = (image[..., 3] < 128).to(pixels)
-    drawn.colors.backward(pixels)
-    assert colors.grad is not None
+    outside = image[..., 3] < 128 if image.shape[2] == 4 else torch.zeros(image.shape[:2])
+    sums, drawn = pixel_sums(gaussians, view, backend, torch.stack([torch.ones(image.shape[:2]), outside], dim=2))
     assert drawn.depths is not None
-    weights = colors.grad[:, 0].cpu() / sh.C0
     solid = drawn.depths[drawn.alphas > 0.5].detach().cpu()
     nearest = float(solid.sort().values[int(NEAREST * len(solid))]) if len(solid) else math.inf
-    return weights[:, 0], weights[:, 1], project(camera, gaussians.means)[2] / nearest
+    return sums[:, 0], sums[:, 1], project(view.camera.to(torch.float32), gaussians.means)[2] / nearest
+
+
+def pixel_sums(
+    gaussians: Gaussians, view: View, backend: Backend, image: Float[Tensor, "H W 2"]
+) -> tuple[Float[Tensor, "N 2"], Rendering]:
+    """The sum over a view's pixels of T alpha times each channel of `image`, for every splat, and a render's depths."""
+    colors = torch.zeros(len(gaussians), 1, 3, device=backend.device, requires_grad=True)
+    shapes = replace(gaussians, shN=gaussians.shN[:, :0].contiguous()).to(backend.device)
+    drawn = rasterize(replace(shapes, sh0=colors), view.camera.to(torch.float32), PLAIN, backend=backend, depth=True)
+    pixels = torch.zeros_like(drawn.colors)
+    pixels[0, ..., :2] = image.to(pixels)
+    drawn.colors.backward(pixels)
+    assert colors.grad is not None
+    return colors.grad[:, 0, :2].cpu() / sh.C0, drawn
 
 
 @one_torch_thread()

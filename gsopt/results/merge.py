@@ -1,12 +1,14 @@
 """Merges two runs of one object: the splats of the second come into the frame of the first, each place from one run.
 
 The similarity between the frames follows from photos that both runs have. In a place that both have splats in, those
-stay that more of their own input views see: the others guess there, and both together would be twice as dense.
+stay that explain the input views of both runs better: both together would be twice as dense. The error of a splat is
+the mean of |render - truth| over the pixels of all these views, weighted by transmittance times alpha.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,15 +23,14 @@ from gsopt.data.sfm.trajectory import align, centers, compare
 from gsopt.errors import InputError
 from gsopt.formats.placement import placed
 from gsopt.gaussians import Gaussians
-from gsopt.results.clean import observe
-from gsopt.results.decimate import masses
-from gsopt.results.finished_run import FinishedRun
+from gsopt.results.clean import pixel_sums
+from gsopt.results.finished_run import FinishedRun, draw, truth
 
 MIN_SHARED = 3
 MAX_DEGREES, MAX_SHIFT = 2.0, 0.05
 """Most by which the median photo may stand otherwise in the second run: turned, and moved, in radii of the cameras."""
-CELLS = 32
-"""Cells along the largest side of the solid splats; each takes its splats from one run."""
+CELLS = 12
+"""Cells along the largest side of the solid splats; each takes its splats from one run. Measured in howto/merge.md."""
 FARTHEST = 1 << 18
 """Cells beyond this one count as this one."""
 TIE = 1e-6
@@ -80,12 +81,12 @@ def merge(first: FinishedRun, second: FinishedRun) -> Merged:
         raise InputError("One run was trained with --antialiased, the other without. Train both alike.")
     scenes = [with_refined_poses(load_scene(run.config.data), run.path) for run in (first, second)]
     alignment = align_by_photos(*scenes)
-    seen = [
-        observe(run.gaussians, scene.train, run.backend).views
-        for run, scene in zip((first, second), scenes, strict=True)
-    ]
     a, b = first.gaussians, alignment.place(second.gaussians)
-    stays = better_seen(a, b, *seen)
+    errors = [
+        error_sums(first, scenes[0].train, here) + error_sums(second, scenes[1].train, there)
+        for here, there in ((a, alignment.place_back(a)), (b, second.gaussians))
+    ]
+    stays = better(a, b, *errors)
     degree = max(a.sh_degree, b.sh_degree)
     both = with_degree(a.select(stays[0]), degree).append(with_degree(b.select(stays[1]), degree))
     return Merged(both, alignment, (int(stays[0].sum()), int(stays[1].sum())))
@@ -113,26 +114,35 @@ def stacked(views: list[View]) -> Float[np.ndarray, "C 4 4"]:
     return np.concatenate([view.camera.viewmats.double().numpy() for view in views])
 
 
-def better_seen(
-    a: Gaussians, b: Gaussians, seen_a: Float[Tensor, "N"], seen_b: Float[Tensor, "M"]
-) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "M"]]:
-    """Splats that stay: in each cell those of the run whose input views see it and the cells around it more often.
+def error_sums(run: FinishedRun, views: Sequence[View], gaussians: Gaussians) -> Float[Tensor, "N 2"]:
+    """Sums over the views of a run for each splat: its weight in pixels, and the weight times their error (0..1)."""
+    total = torch.zeros(len(gaussians), 2)
+    settings = replace(run.settings, sh_degree=gaussians.sh_degree)
+    for view in views:
+        drawn = draw(gaussians, view.camera, run.backend, settings, run.background)
+        error = (drawn.float() - truth(view, run.background).float()).abs().mean(2) / 255
+        total += pixel_sums(gaussians, view, run.backend, torch.stack([torch.ones_like(error), error], dim=2))[0]
+    return total
 
-    `seen_a`, `seen_b`: input views of its own run that see a splat. The first run's stay in a draw. Splats of b that no
-    view sees do not stay.
+
+def better(
+    a: Gaussians, b: Gaussians, sums_a: Float[Tensor, "N 2"], sums_b: Float[Tensor, "M 2"]
+) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "M"]]:
+    """Splats that stay: in each cell, with the cells around it, those of the run with the smaller mean error.
+
+    `sums_a`, `sums_b`: of `error_sums`. A draw goes to the first run. Splats of b that no view sees do not stay.
     """
     means = torch.cat([a.means, b.means]).double()
     opacities = torch.cat([a.opacities, b.opacities])
     cells, rows = torch.unique(cells_of(means, means[opacities >= SOLID]), dim=0, return_inverse=True)
     places = rows.split([len(a), len(b)])
-    views = []
-    for gaussians, place, seen in zip((a, b), places, (seen_a, seen_b), strict=True):
-        mass = masses(gaussians)
-        sums = torch.zeros(len(cells), 2, dtype=torch.float64)
-        sums = with_neighbors(cells, sums.index_add_(0, place, torch.stack([mass * seen, mass], dim=1)))
-        views.append(sums[:, 0] / sums[:, 1].clamp_min(1e-300))
-    second = views[1] > views[0] * (1 + TIE)
-    return ~second[places[0]], second[places[1]] & (seen_b > 0)
+    errors = []
+    for place, sums in zip(places, (sums_a, sums_b), strict=True):
+        total = torch.zeros(len(cells), 2, dtype=torch.float64).index_add_(0, place, sums.double())
+        total = with_neighbors(cells, total)
+        errors.append(torch.where(total[:, 0] > 0, total[:, 1] / total[:, 0].clamp_min(1e-300), math.inf))
+    second = errors[1] < errors[0] * (1 - TIE)
+    return ~second[places[0]], second[places[1]] & (sums_b[:, 0] > 0)
 
 
 def cells_of(means: Float[Tensor, "N 3"], solid: Float[Tensor, "S 3"]) -> Int[Tensor, "N 3"]:
