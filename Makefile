@@ -6,7 +6,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PYTHON313 ?= python3.13
 RUN ?=
-TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds,llm,mesh
+TEST_EXTRAS := dev,viewer,video,spz,blender,sfm,sds,llm,mesh,usd
 
 SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1
 

@@ -33,8 +33,8 @@ class Flags:
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """A splat file or a run directory (its splat.ply)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, or .html: one
-    page with viewer, input cameras and camera path, which needs no network."""
+    """The file to write; its ending chooses the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .usda, .usdc,
+    or .html: one page with viewer, input cameras and camera path, which needs no network."""
     force: bool = False
     """Replace OUT if it exists."""
     decimate: str = "100%"

@@ -8,6 +8,7 @@
 | `.spz` | Niantic SPZ | 24-bit position, 8-bit rest |
 | `.sog` | PlayCanvas SOG bundle | 16-bit position, 256 scales and colors, a palette of harmonics |
 | `.glb` | glTF, KHR_gaussian_splatting (release candidate) | rounding of exp and sigmoid |
+| `.usda`, `.usdc` | OpenUSD's ParticleField, with usd-core | rounding of exp and sigmoid |
 | `.ksplat` | mkkellogg's; is read only | |
 """
 
@@ -23,7 +24,7 @@ from gsopt.formats.units import UNKNOWN, Units
 if TYPE_CHECKING:
     from gsopt.gaussians import Gaussians
 
-SUFFIXES = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb")
+SUFFIXES = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb", ".usda", ".usdc")
 READABLE = (*SUFFIXES, ".ksplat")
 
 
@@ -42,7 +43,8 @@ def save_splats(
     """Write `gaussians` in the format that the suffix of `path` names; whole file or nothing.
 
     `antialiased`: the splats were optimized with the 2D filter of Mip-Splatting; recorded by formats that can (.ply,
-    .spz, .sog). `units`: scale and origin, which .ply, .compressed.ply, .sog and .glb carry. Raises InputError for a
+    .spz, .sog). `units`: scale and origin, which .ply, .compressed.ply, .sog, .glb, .usda and
+    .usdc carry. Raises InputError for a
     row that is not finite, a rotation of length zero, a full disk or an unknown suffix.
     """
     path = Path(path)
@@ -71,6 +73,10 @@ def save_splats(
             from gsopt.formats.gltf import save_glb
 
             save_glb(path, gaussians, units=units)
+        case ".usda" | ".usdc":
+            from gsopt.formats.usd import save_usd
+
+            save_usd(path, gaussians, units=units)
 
 
 def load_splats(path: str | PathLike[str], *, strict: bool = False) -> Gaussians:
@@ -110,6 +116,10 @@ def _read(path: Path) -> Gaussians:
             from gsopt.formats.gltf import load_glb
 
             return load_glb(path)
+        case ".usda" | ".usdc":
+            from gsopt.formats.usd import load_usd
+
+            return load_usd(path)
         case _:
             from gsopt.formats.compressed_ply import load_any_ply
 

@@ -1,8 +1,8 @@
 """Scale and origin of a scene, as files of splats and meshes carry them.
 
-PLY: comments `Meters per unit: S` and `Origin: X Y Z`; .glb: `extras` of the node; .sog: `gsopt` in meta.json. A
-position p of the file lies at origin + p in the source's coordinates, and its lengths times S are meters. Notes that
-cannot be read count as absent: they are no reason to refuse splats.
+PLY: comments `Meters per unit: S` and `Origin: X Y Z`; .glb: `extras` of the node; .sog and USD: `gsopt` in meta.json
+and in the layer. A position p of the file lies at origin + p in the source's coordinates, and its lengths times S are
+meters. Notes that cannot be read count as absent: they are no reason to refuse splats.
 """
 
 from __future__ import annotations
@@ -86,6 +86,10 @@ def read_units(path: Path) -> Units:
         from gsopt.formats.sog import sog_meta
 
         return units_from_notes(sog_meta(path).get("gsopt"))
+    if suffix in (".usda", ".usdc"):
+        from gsopt.formats.usd import usd_units
+
+        return usd_units(path)
     return UNKNOWN
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import struct
 from dataclasses import dataclass
 
@@ -9,8 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsopt.formats import SUFFIXES
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.quats import normalize
+
+WRITABLE = tuple(s for s in SUFFIXES if not s.startswith(".usd") or importlib.util.find_spec("pxr"))
+"""Formats that can be written here: USD needs usd-core."""
 
 
 def make_splats(count: int = 300, degree: int = 3, seed: int = 0) -> Gaussians:

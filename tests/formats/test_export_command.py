@@ -7,16 +7,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from splat_samples import errors, make_splats, same_bits
+from splat_samples import WRITABLE, errors, make_splats, same_bits
 
 from gsopt.cli import main
 from gsopt.errors import InputError, UsageError
-from gsopt.formats import SUFFIXES, is_antialiased, load_splats, save_splats
+from gsopt.formats import is_antialiased, load_splats, save_splats
 
 USAGE, INPUT = UsageError.exit_code, InputError.exit_code
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITABLE)
 def test_every_format_can_be_the_target(tmp_path: Path, suffix: str) -> None:
     save_splats(tmp_path / "in.ply", make_splats(20))
     assert main(["export", str(tmp_path / "in.ply"), "-o", str(tmp_path / f"out{suffix}")]) == 0

@@ -7,10 +7,10 @@ import os
 from pathlib import Path
 
 import pytest
-from splat_samples import make_splats, same_bits
+from splat_samples import WRITABLE, make_splats, same_bits
 
 from gsopt.errors import InputError
-from gsopt.formats import SUFFIXES, load_splats, save_splats
+from gsopt.formats import load_splats, save_splats
 from gsopt.formats.files import replacing
 
 
@@ -18,7 +18,7 @@ def disk_full(*_: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITABLE)
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_full_disk_leaves_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, step: str
