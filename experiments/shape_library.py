@@ -20,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from few_photos import photo, scenes
+from few_photos import photos, scenes
 
 from gsopt.benchmark.machine import machine
 from gsopt.events import to_json, write_atomic
@@ -88,7 +88,7 @@ def run(scene: Path, seed: int, arm: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command = [sys.executable, "-m", "gsopt", "train", str(scene), "-m", f"{folder}/run", "--threads", "1"]
-        command += ["--view-ids", str(photo(scene, seed)), "--seed", str(seed), "--checkpoint-every", "0"]
+        command += ["--view-ids", str(photos(scene, 1, seed)[0]), "--seed", str(seed), "--checkpoint-every", "0"]
         command += ["--preview-every", "0", *flags(arm, scene.name, folder)]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         metrics = json.loads((folder / "run" / "metrics.json").read_text())

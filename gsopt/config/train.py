@@ -189,6 +189,8 @@ class SparseConfig:
     """Weight that replaces the one of LossConfig where this is larger."""
     lambda_alpha: Weight = 0.5
     """Weight that replaces the one of LossConfig where this is larger."""
+    lambda_unseen: Weight = 0.1
+    """Weight of a term that keeps an object with masks, shown by two to four photos, free of haze from other sides."""
     sh_degree: ShDegree = 2
     """Upper bound on the bands."""
     symmetry: Literal["auto", "off"] = "auto"

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsopt.data.scene import Scene, View
 from gsopt.gaussians import Gaussians
-from gsopt.geometry.cameras import Cameras, look_at
-from gsopt.geometry.focus import world_up
+from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.sh import sh0_from_rgb
+from gsopt.geometry.surrounding import surrounding_cameras
 from gsopt.geometry.voxels import Grid
 from gsopt.init.inflation import inflated, object_box
 from gsopt.init.rim_colors import without_rim
@@ -24,14 +24,11 @@ from gsopt.raster.backend import Backend, RasterSettings
 
 COUNT = 16
 """Number of guessed views."""
-HEIGHTS = (-0.1, 0.95)
-"""Sines of the lowest and highest elevation of their cameras."""
 COLOR_WEIGHT = 0.3
 """Weight of their colors in the loss, beside 1 for the photo; at 0 the unseen sides show streaks of background."""
 SPLAT_SCALE = 0.6
 """Standard deviation of the splats that draw the voxels, voxels."""
 OPAQUE_LOGIT = 6.0
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ def with_guessed_views(scene: Scene, backend: Backend) -> Scene:
     if grid is None:
         return scene
     middle = object_middle(photos[0], scene.extent) if len(photos) == 1 else grid.centers().mean(0)
-    cameras = surrounding_cameras(photos[0], middle)
+    cameras = surrounding_cameras(photos[0].camera, middle, COUNT)
     store = DrawnImages(drawn_voxels(grid, photos, cameras, backend, scene.body_colors))
     views = [View(f"guess_{i:02d}", cameras[i], store, i, color=COLOR_WEIGHT) for i in range(COUNT)]
     return replace(scene, guessed=tuple(views))
@@ -62,21 +59,6 @@ def with_guessed_views(scene: Scene, backend: Backend) -> Scene:
 def object_middle(photo: Thumbnail, extent: float) -> Float[Tensor, "3"]:
     """The middle of the object in a single photo."""
     return object_box(photo.camera, photo.alpha()[0] > 0.5, extent)[0]
-
-
-def surrounding_cameras(photo: Thumbnail, middle: Float[Tensor, "3"]) -> Cameras:
-    """Cameras on a spiral around the object (Fibonacci), at the photo's distance, with its lens and size."""
-    distance = float((photo.camera.centers[0] - middle).norm())
-    number = torch.arange(COUNT) + 0.5
-    height = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * number / COUNT
-    angle, level = number * GOLDEN_ANGLE, (1 - height**2).sqrt()
-    up = world_up(photo.camera.viewmats)
-    ahead = torch.linalg.cross(up, photo.camera.viewmats[0, 0, :3])
-    ahead = ahead / ahead.norm()
-    aside = torch.linalg.cross(up, ahead)
-    offsets = (level * angle.cos())[:, None] * ahead + (level * angle.sin())[:, None] * aside + height[:, None] * up
-    viewmats = look_at(middle + distance * offsets, middle, up).to(photo.camera.viewmats)
-    return replace(photo.camera, viewmats=viewmats, Ks=photo.camera.Ks.repeat(COUNT, 1, 1))
 
 
 def drawn_voxels(

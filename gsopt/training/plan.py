@@ -47,6 +47,8 @@ class LossWeights:
     opacity: float
     scale: float
     depth: float
+    unseen: float
+    """The term on views between few photos of a masked object."""
 
 
 @dataclass(frozen=True)
@@ -212,13 +214,13 @@ def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool) -> LossWeig
     opacity = default if loss.lambda_opacity is None else loss.lambda_opacity
     scale = default if loss.lambda_scale is None else loss.lambda_scale
     if not sparse:
-        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, loss.lambda_depth)
+        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, loss.lambda_depth, unseen=0.0)
     raised = (
         max(alpha, few.lambda_alpha),
         max(opacity, few.lambda_opacity * (1 if has_alpha else OPAQUE_SHARE)),
         max(scale, few.lambda_scale),
     )
-    return LossWeights(loss.lambda_dssim, *raised, loss.lambda_depth)
+    return LossWeights(loss.lambda_dssim, *raised, loss.lambda_depth, few.lambda_unseen)
 
 
 def density_plan(config: DensityConfig, budget: int, extent: float) -> DensityPlan:

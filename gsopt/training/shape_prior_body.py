@@ -12,7 +12,8 @@ from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
-from gsopt.init.guessed_views import drawn_voxels, surrounding_cameras
+from gsopt.geometry.surrounding import surrounding_cameras
+from gsopt.init.guessed_views import COUNT, drawn_voxels
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.backend import Backend
 from gsopt.results.video import save_stills
@@ -96,7 +97,7 @@ def _require_the_same(directory: RunDirectory, record: dict[str, Any]) -> None:
 
 def _show(body: PriorBody, photos: list[Thumbnail], record: dict[str, Any], backend: Backend, folder: Path) -> None:
     """Pictures of the body on white, and the record, for the report."""
-    cameras = surrounding_cameras(photos[0], body.grid.centers().mean(0))
+    cameras = surrounding_cameras(photos[0].camera, body.grid.centers().mean(0), COUNT)
     cameras = cameras[slice(SHOWN_EVERY // 2, None, SHOWN_EVERY)]
     images = drawn_voxels(body.grid, photos, cameras, backend, body.colors).float() / 255
     white = images[..., :3] * images[..., 3:] + 1 - images[..., 3:]

@@ -30,6 +30,7 @@ from gsopt.training.running_means import RunningMeans
 from gsopt.training.schedule import Flatness
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import Target, Targets
+from gsopt.training.unseen_views import UnseenViews
 from gsopt.training.view_order import ViewOrder, generators
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class Trainer:
         self.poses = PoseRefinement(plan.poses, scene, self._last) if plan.poses.refine else None
         self.exposure = Exposure(plan.exposure, scene, self._last) if plan.exposure.learn else None
         self._average = RunningAverage(plan.schedule.averages_after) if plan.opaque else None
+        self._unseen = UnseenViews.of(scene, plan.weights.unseen, self._last)
         self._generators = generators(plan.seed)
         views, images = len(scene.train), len(scene.drawn) - len(scene.train)
         self._order = ViewOrder(views, self._generators["views"], images, plan.extra_per_epoch)
@@ -97,6 +99,8 @@ class Trainer:
             self.poses.update(index, self.step, self.model.gaussians, gradients, settings.sh_degree)
         if self._guidance is not None:
             self._guidance.add(self.step, self.model.gaussians, settings, gradients)
+        if self._unseen is not None:
+            self._unseen.add(self.step, self.model.gaussians, self.backend, gradients)
         self._update(gradients, target.camera, settings)
         self._change_set()
         if self._average is not None:
