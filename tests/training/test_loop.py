@@ -266,3 +266,17 @@ def test_the_first_difference_is_named_with_both_values() -> None:
 def test_errors_have_the_exit_codes_that_the_help_promises() -> None:
     codes = [kind("x").exit_code for kind in (GsoptError, UsageError, InputError, NumericalError)]
     assert codes == [1, 2, 3, 4]
+
+
+def test_the_speed_is_a_mean_of_recent_speeds_that_follows_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(loop.time, "perf_counter", lambda: now[0])
+    clock = loop.Clock(40, 0.0, 0.0)
+    found = []
+    for step in (*range(60, 161, 20), *range(161, 181)):  # 10 steps a second at first, then half a step a second
+        now[0] += 2
+        found.append(clock.rate(step))
+    assert found[:6] == pytest.approx([10.0] * 6)
+    assert 0.5 < found[6] < 10
+    assert found[6:] == sorted(found[6:], reverse=True)
+    assert found[-1] == pytest.approx(0.5, rel=0.05)

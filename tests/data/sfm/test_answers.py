@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import textured_room as room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.data.sfm import diagnosis
+from gsopt.data.sfm import diagnosis, mapping
 from gsopt.data.sfm.features import ViewGraph, choose_matching, neighbors_in_time, reader_options
 from gsopt.data.sfm.mapping import mappers_to_try, off_center, seed_photos
 from gsopt.data.sfm.photos import Photo, RejectedFile
@@ -38,6 +40,21 @@ def graph(
 
 
 CHAIN = {(0, 1): 500, (1, 2): 400, (2, 3): 300}
+
+
+@pytest.mark.parametrize(
+    ("mapper", "runs"), [("incremental", "_incremental"), ("global", "_global"), ("hybrid", "_global")]
+)
+def test_the_mapper_that_is_asked_for_runs(
+    mapper: str, runs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[str] = []
+    for name in ("_incremental", "_global"):
+        monkeypatch.setattr(mapping, name, lambda *_, name=name: ran.append(name) or [])
+    colmap = SimpleNamespace(set_random_seed=ran.append)
+    project = SimpleNamespace(pycolmap=colmap, config=SfmConfig(seed=7), database=tmp_path / "database.db")
+    assert mapping.run_mapper(project, mapper, graph(CHAIN)) == []  # type: ignore[arg-type]
+    assert ran == [7, runs]
 
 
 @pytest.mark.parametrize(
