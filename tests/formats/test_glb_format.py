@@ -377,6 +377,14 @@ def test_points_have_linear_color(tmp_path: Path) -> None:
     assert color[:3].tolist() == pytest.approx([0.21404, 0, 1], abs=1e-4)
 
 
+def test_the_coding_of_srgb_is_that_of_the_standard() -> None:
+    """IEC 61966-2-1: a line for the dark values, a power for the rest."""
+    linear = torch.tensor([0.0, 0.001, 0.003, 0.0031308, 0.004, 0.21404, 1.0])
+    coded = torch.tensor([0.0, 0.01292, 0.03876, 0.04045, 0.05071, 0.5, 1.0])
+    torch.testing.assert_close(srgb_from_linear(linear), coded, atol=2e-5, rtol=0)
+    torch.testing.assert_close(linear_from_srgb(coded), linear, atol=2e-5, rtol=0)
+
+
 def test_splats_of_linear_color_are_coded(tmp_path: Path) -> None:
     """The base color exactly; the change with the direction to first order."""
     splats = make_splats(40, degree=1)

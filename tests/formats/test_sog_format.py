@@ -16,7 +16,7 @@ from PIL import Image
 from splat_samples import make_splats
 
 from gsopt.errors import InputError
-from gsopt.formats import load_splats, save_splats
+from gsopt.formats import is_antialiased, load_splats, save_splats
 
 Members = dict[str, bytes]
 
@@ -72,6 +72,24 @@ def test_known_pixels_read_as_known_values(tmp_path: Path) -> None:
     assert splats.opacities.item() == pytest.approx(0.2)
     assert splats.quats[0].tolist() == pytest.approx([0.5**0.5, 0, -(0.5**0.5), -(0.5**0.5)])  # clamped, then unit
     assert splats.shN[0].tolist() == [pytest.approx(row) for row in ([0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9])]
+
+
+@pytest.mark.parametrize(
+    ("mark", "expected"),
+    [
+        ({"model": "antialiased"}, True),
+        ({"antialias": True}, True),
+        ({"antialias": False}, False),
+        ({"antialias": "yes"}, False),
+        ({}, False),
+    ],
+)
+def test_either_mark_of_antialiasing_is_read(
+    tmp_path: Path, bundle: tuple[Members, dict[str, Any]], mark: dict[str, Any], expected: bool
+) -> None:
+    files, meta = bundle
+    write(tmp_path / "b.sog", files, meta | mark)
+    assert is_antialiased(tmp_path / "b.sog") is expected
 
 
 def test_equal_splats_give_one_palette_entry_each(tmp_path: Path) -> None:

@@ -66,9 +66,18 @@ def test_a_run_is_rendered_along_a_file_that_it_wrote(tmp_path: Path, capsys: py
     assert "turntable" in capsys.readouterr().err
 
 
+def scaled(*by: float) -> list[float]:
+    """A matrix that stretches the axes."""
+    return [by[0], 0, 0, 0, 0, by[1], 0, 0, 0, 0, by[2], 3, 0, 0, 0, 1]
+
+
 @pytest.mark.parametrize(
     "change",
     [
+        *(
+            {"camera_path": [{"fov": 50, "camera_to_world": scaled(*by)}]}
+            for by in ((1.01, 1, 1), (1, 1, 0), (1, -1, 1))
+        ),
         {"render_width": 0},
         {"render_height": 1e9},
         {"render_width": True},
