@@ -43,7 +43,7 @@ bench: $(VENV)/.for-test
 stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
-# Every call that changes the disk is made to fail once, in every way: killed, full, broken, half written. Two hours.
+# Every call that changes the disk is made to fail, in every way: killed, full, broken, half written. An hour or two.
 every-write: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_EVERY_WRITE=full $(PY) -m pytest tests/every_write
 

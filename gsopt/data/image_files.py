@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -13,6 +15,14 @@ MAX_PIXELS = 1 << 27
 MAX_EXPANSION = 1000
 """Decoded bytes per byte of the file; an empty JPEG has 260. Only images of more than MAX_PIXELS bytes are compared,
 because an empty mask may shrink without bound."""
+
+
+def write_image(image: Image.Image, path: Path, **options: Any) -> None:
+    """Writes a .png or .jpg, encoded in memory: Pillow's own writer leaves a gap where the disk takes less than it is
+    given."""
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG" if path.suffix == ".png" else "JPEG", **options)
+    path.write_bytes(buffer.getvalue())
 
 
 def bomb(image: Image.Image, path: Path, channels: int = 4, max_pixels: int = MAX_PIXELS) -> str:

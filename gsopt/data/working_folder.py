@@ -25,7 +25,8 @@ def working_folder(out: Path) -> Iterator[Path]:
     try:
         yield work
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        for _ in range(2):  # a disk that failed once may work again
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def sweep(out: Path) -> None:

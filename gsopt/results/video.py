@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -52,7 +53,9 @@ def write_video(file: BinaryIO, images: Iterator[Image.Image], kind: str, fps: f
     duration = round(1000 / fps) if kind == ".webp" else max(20, 10 * round(100 / fps))
     options: dict[str, Any] = {"quality": WEBP_QUALITY, "method": 4} if kind == ".webp" else {"optimize": False}
     options |= {"append_images": images, "duration": duration, "loop": 0}
-    first.save(file, format=kind[1:].upper(), save_all=True, **options)
+    buffer = io.BytesIO()  # Pillow's own writer leaves a gap where the disk takes less than it is given
+    first.save(buffer, format=kind[1:].upper(), save_all=True, **options)
+    file.write(buffer.getvalue())
 
 
 def _write_mp4(file: BinaryIO, images: Iterator[Image.Image], fps: float) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from dataset_builders import nerf_synthetic
 from PIL import Image
 
+from gsopt.data.image_files import write_image
 from gsopt.data.images import read_gray, read_header, read_pixels
 from gsopt.data.scene import load_scene
 from gsopt.data.sfm.photos import read_photos
@@ -111,3 +114,22 @@ def test_an_empty_mask_of_a_large_photo_is_no_bomb(tmp_path: Path) -> None:
     path = one_bit_png(tmp_path / "a.png", 8192)
     assert path.stat().st_size < 10_000
     assert read_gray(path, (64, 64)).shape == (64, 64)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_an_image_that_the_disk_takes_in_part_is_an_error(tmp_path: Path, suffix: str) -> None:
+    """Pillow's own writer ends well there, and leaves half of a JPEG."""
+    import resource
+
+    pixels = np.random.default_rng(0).integers(0, 256, (60, 60, 3), dtype=np.uint8)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(OSError, match="large"):
+            write_image(Image.fromarray(pixels), tmp_path / f"a{suffix}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    write_image(Image.fromarray(pixels), tmp_path / f"a{suffix}")
+    with Image.open(tmp_path / f"a{suffix}") as found:
+        assert (found.format, found.size) == ({".jpg": "JPEG", ".png": "PNG"}[suffix], (60, 60))

@@ -75,7 +75,8 @@ class ForkedChild:
 
 
 KINDS = ("none", "kill", "fail once", "fail from here", "short")
-LONGEST_SECONDS = 120
+LONGEST_SECONDS = 900
+"""A run takes seconds, or minutes on a machine with much else to do."""
 FULL = os.environ.get("GSOPT_EVERY_WRITE") == "full"
 
 

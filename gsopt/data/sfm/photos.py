@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from gsopt.data import files
-from gsopt.data.image_files import IMAGE_FORMATS, bomb
+from gsopt.data.image_files import IMAGE_FORMATS, bomb, write_image
 from gsopt.errors import InputError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif")
@@ -232,7 +232,7 @@ def _scene_name(path: Path, kind: str, has_alpha: bool, taken: set[str]) -> str:
 
 def _save(image: Image.Image, path: Path) -> None:
     options: dict[str, Any] = {"quality": 97, "subsampling": 0} if path.suffix == ".jpg" else {"compress_level": 3}
-    image.save(path, exif=Image.Exif(), **options)
+    write_image(image, path, exif=Image.Exif(), **options)
     os.chmod(path, 0o644)
 
 

@@ -35,7 +35,7 @@ from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.video import extract_frames, is_video
 from gsopt.data.sfm.write_scene import SCENE, write_scene
-from gsopt.data.working_folder import working_folder
+from gsopt.data.working_folder import sweep, working_folder
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
 
@@ -63,6 +63,7 @@ def pose_photos(source: Path, out: Path, config: SfmConfig, report: Report = lam
     if not source.exists():
         raise InputError(f"{source} does not exist. Give a folder of photos or a video.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        sweep(out)  # one that was killed after its last rename is complete
         raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
     with working_folder(out) as work:
         found, seconds = run_in_child(source, work, config, report)

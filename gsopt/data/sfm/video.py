@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from PIL import Image
 
 from gsopt._optional import require
-from gsopt.data.image_files import MAX_PIXELS
+from gsopt.data.image_files import MAX_PIXELS, write_image
 from gsopt.data.sfm.photos import sharpness
 from gsopt.errors import InputError
 
@@ -181,5 +181,5 @@ def _decoded(av: ModuleType, video: Path) -> Iterator[tuple[int, Any]]:
 
 def _write(image: Image.Image, folder: Path, index: int) -> Path:
     path = folder / f"frame_{index + 1:05d}.jpg"
-    image.convert("RGB").save(path, quality=_JPEG_QUALITY, subsampling=0)
+    write_image(image.convert("RGB"), path, quality=_JPEG_QUALITY, subsampling=0)
     return path

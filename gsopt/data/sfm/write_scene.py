@@ -13,6 +13,7 @@ from PIL import Image
 
 from gsopt.config.train import DataConfig
 from gsopt.data.colmap import read_colmap
+from gsopt.data.image_files import write_image
 from gsopt.data.images import ImageStore
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import View, load_scene
@@ -127,7 +128,7 @@ def _write_view(view: View, found: Path, scene: Path, name: str) -> str:
     options: dict[str, Any] = (
         {"compress_level": 3} if path.suffix == ".png" else {"quality": JPEG_QUALITY, "subsampling": 0}
     )
-    Image.fromarray(pixels).save(path, **options)
+    write_image(Image.fromarray(pixels), path, **options)
     return name
 
 

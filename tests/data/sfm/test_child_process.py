@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import textured_room as room
@@ -16,7 +18,7 @@ from gsopt.data.sfm import child_process
 from gsopt.data.sfm.pipeline import pose_photos
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.working_folder import working_folder
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 
 
 @pytest.fixture
@@ -45,6 +47,32 @@ def test_a_refusal_of_the_child_is_the_error_of_the_parent(tmp_path: Path) -> No
     with pytest.raises(InputError, match="One photo alone has no parallax"):
         pose_photos(tmp_path / "photos", tmp_path / "scene", SfmConfig())
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_what_a_run_left_that_was_killed_when_all_was_done_is_removed_too(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "scene" / "images").mkdir(parents=True)
+    (tmp_path / f".scene.{ended.pid}.tmp" / "photos").mkdir(parents=True)
+    with pytest.raises(UsageError, match="must not exist yet"):
+        pose_photos(tmp_path / "photos", tmp_path / "scene", SfmConfig())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "scene"]
+
+
+def test_a_disk_that_refuses_to_remove_a_file_once_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals = [OSError(errno.EIO, "once")]
+    unlink = os.unlink
+
+    def refusing(*args: Any, **keywords: Any) -> None:
+        if refusals:
+            raise refusals.pop()
+        unlink(*args, **keywords)
+
+    with working_folder(tmp_path / "scene") as work:
+        (work / "photo.jpg").write_bytes(b"")
+        monkeypatch.setattr(os, "unlink", refusing)
+    assert (list(tmp_path.iterdir()), refusals) == ([], [])
 
 
 def test_what_a_killed_run_left_is_removed_and_that_of_a_living_one_is_kept(tmp_path: Path) -> None:
