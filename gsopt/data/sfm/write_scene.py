@@ -19,6 +19,7 @@ from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.placement import Similarity
+from gsopt.errors import InputError
 from gsopt.events import to_json, write_atomic
 from gsopt.geometry.cameras import opengl_from_viewmats
 
@@ -43,8 +44,7 @@ def write_scene(
         _write_undistorted(pycolmap, reconstruction, found, scene)
     else:
         _write_as_taken(reconstruction, found, scene)
-    _model_folder(reconstruction, scene)
-    reconstruction.export_PLY(scene / "points.ply")
+    export_model(reconstruction, scene, work / "again")
     write_atomic(scene / "transforms.json", to_json(transforms(read_colmap(scene).frames, similarity)))
     return scene
 
@@ -82,6 +82,17 @@ def _frame(frame: PosedImage) -> dict[str, Any]:
 
 def _rotation(pycolmap: ModuleType, similarity: Similarity) -> Any:
     return pycolmap.Rotation3d(np.ascontiguousarray(similarity.rotation))
+
+
+def export_model(reconstruction: Any, folder: Path, again: Path) -> None:
+    """Writes sparse/0/ and points.ply into `folder`, and `again`: COLMAP's writers do not notice a disk that refuses a
+    part. Raises InputError where the two differ."""
+    for target in (folder, again):
+        _model_folder(reconstruction, target)
+        reconstruction.export_PLY(target / "points.ply")
+    for file in (folder / "points.ply", *sorted((folder / "sparse" / "0").iterdir())):
+        if file.read_bytes() != (again / file.relative_to(folder)).read_bytes():
+            raise InputError(f"The disk took only a part of {file.name}. Make room, or choose another `--out`.")
 
 
 def _model_folder(reconstruction: Any, folder: Path) -> None:

@@ -17,6 +17,7 @@ pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
 from gsopt.data.sfm import child_process
 from gsopt.data.sfm.pipeline import pose_photos
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.write_scene import export_model
 from gsopt.data.working_folder import working_folder
 from gsopt.errors import InputError, UsageError
 
@@ -58,6 +59,27 @@ def test_what_a_run_left_that_was_killed_when_all_was_done_is_removed_too(tmp_pa
     with pytest.raises(UsageError, match="must not exist yet"):
         pose_photos(tmp_path / "photos", tmp_path / "scene", SfmConfig())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "scene"]
+
+
+class CarelessWriter:
+    """Writes a model as COLMAP does, and at one call, counted down, only its beginning."""
+
+    def __init__(self, call: int) -> None:
+        self.call = call
+
+    def write(self, folder: Path) -> None:
+        self.export_PLY(folder / "points3D.bin")
+
+    def export_PLY(self, path: Path) -> None:
+        self.call -= 1
+        path.write_bytes(b"header" if self.call == 0 else b"header and points")
+
+
+@pytest.mark.parametrize("call", [1, 2, 3, 4])
+def test_a_model_that_the_disk_took_in_part_is_an_error(tmp_path: Path, call: int) -> None:
+    export_model(CarelessWriter(0), tmp_path / "a", tmp_path / "b")
+    with pytest.raises(InputError, match=r"a part of (points\.ply|points3D\.bin)"):
+        export_model(CarelessWriter(call), tmp_path / "c", tmp_path / "d")
 
 
 def test_a_disk_that_refuses_to_remove_a_file_once_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
