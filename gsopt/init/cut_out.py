@@ -25,6 +25,8 @@ from gsopt.data.mask_network import MaskNetwork, find_model
 from gsopt.data.masks import FOLDER
 from gsopt.data.scene import Scene, is_posed, load_scene, read_dataset
 from gsopt.data.sfm.photos import find_photos, read_photos
+from gsopt.data.sfm.reuse import needs_poses
+from gsopt.data.sfm.video import is_video
 from gsopt.data.working_folder import working_folder
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
@@ -41,6 +43,8 @@ MAX_ROUNDS = 3
 """Most looks at a crop."""
 SAME_BOX = 0.9
 """Overlap (intersection over union) of two crops from which on the second is not looked at."""
+NO_ALPHA = (".jpg", ".jpeg")
+"""Endings of photos that cannot be masked themselves."""
 WHOLE = 0.8
 """Share of a photo from which on a crop shows nothing new."""
 
@@ -256,6 +260,21 @@ def with_made_masks(config: DataConfig, folder: Path, report: Report) -> DataCon
     for line in cut_out(source, out, network, report).lines():
         report(line)
     return replace(config, masks=str(out))
+
+
+def require_mask_model(config: DataConfig) -> None:
+    """MissingDependency where `--masks auto` will need a network and none is here: before poses are sought, which takes
+    minutes."""
+    photos = Path(config.path)
+    if config.masks == "auto" and needs_poses(photos) and not may_bring_masks(photos):
+        find_model(config.mask_model)
+
+
+def may_bring_masks(photos: Path) -> bool:
+    """False for a video and for a folder of JPEG files, which have no alpha, without masks beside them."""
+    if is_video(photos):
+        return False
+    return (photos / FOLDER).is_dir() or any(path.suffix.lower() not in NO_ALPHA for path in find_photos(photos))
 
 
 def has_masks(scene: Scene) -> bool:

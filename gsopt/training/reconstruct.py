@@ -16,7 +16,7 @@ from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import UsageError
 from gsopt.events import Report, to_json, write_atomic
 from gsopt.gaussians import Gaussians
-from gsopt.init.cut_out import with_made_masks
+from gsopt.init.cut_out import require_mask_model, with_made_masks
 from gsopt.results.evaluation import OnView, evaluate, networks, read_metrics
 from gsopt.training.interrupt import Stopped, StopRequest
 from gsopt.training.loop import PROGRESS_SECONDS, TrainResult, train
@@ -53,13 +53,14 @@ def reconstruct(
     settings in `run`. `settings`: fields of TrainConfig, a section as a dict: `preset="draft"`,
     `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `vgg`: LPIPS by VGG too. `on_progress` is called
     with every event, `log` with lines for people. Raises a GsoptError; a wrong setting, prompt or prior, an unreadable
-    held-out image or missing weights raise it before any work.
+    held-out image, missing weights or a missing mask model raise it before any work.
     """
     run = Path(run)
     config = _with_absolute_paths(_configured(data, run, config, resume, settings))
     if not resume:
         refuse_another_run(run)
         _require_prior(config.guidance)
+        require_mask_model(config.data)
     networks(vgg)
     read_metrics(run)
     config = _with_masks(_with_poses(config, run, log), run, log)

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from run_configs import HANGUP
 from tiny_scenes import write_dataset
 
 import gsopt
 from gsopt import cli
 from gsopt.config.train import DataConfig, TrainConfig
-from gsopt.errors import GsoptError, InputError, SettingError, UsageError
+from gsopt.errors import GsoptError, InputError, MissingDependency, SettingError, UsageError
 from gsopt.events import read_events
 from gsopt.results.evaluation import read_metrics
 
@@ -53,6 +54,22 @@ def test_python_and_the_command_line_write_the_same_run(data: Path, tmp_path: Pa
     assert len(result.gaussians) == len(gsopt.load_splats(result.run / "splat.ply"))
     assert (events[0], events[-1], events.count("done")) == ("started", "done", 1)
     assert any("evaluating" in line for line in lines)
+
+
+def test_a_missing_mask_model_is_told_before_poses_are_sought(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    monkeypatch.delenv("GSOPT_MASK_MODEL", raising=False)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        Image.new("RGB", (32, 32), (200, 40, 90)).save(photos / name)
+    with pytest.raises(MissingDependency, match="mask model"):
+        gsopt.reconstruct(DataConfig(str(photos), masks="auto"), tmp_path / "run", **SHORT)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
+    (photos / "masks").mkdir()
+    with pytest.raises(GsoptError) as raised:  # masks that may serve: the poses come first, and cannot be had
+        gsopt.reconstruct(DataConfig(str(photos), masks="auto"), tmp_path / "run", **SHORT)
+    assert not isinstance(raised.value, MissingDependency)
 
 
 def test_a_finished_run_is_refused_and_resumed_from_its_folder_alone(data: Path, tmp_path: Path) -> None:
