@@ -1,4 +1,4 @@
-"""What do fewer splats cost: merged, left out by what they contribute, or both, as `gsopt export --decimate` does?
+"""Measures what fewer splats cost: merged, left out by what they contribute, or both, as `gsopt export --decimate`.
 
     python experiments/decimate.py RUN... [--draw] [-o FILE.json]
 

@@ -28,7 +28,7 @@ SOLID = 0.8
 COUNT = 16
 """Number of cameras around the object."""
 TURN = 7
-"""Cameras from one use to the next, so that neighbors do not follow each other; no divisor of COUNT."""
+"""Cameras from one use to the next, so that neighbors do not follow each other; it shares no divisor with COUNT."""
 EVERY = 2
 """Steps from one use to the next."""
 DOWNSCALE = 2

@@ -1,4 +1,4 @@
-"""What is done after training runs with one thread of torch, and gives the others back."""
+"""Work on a finished run takes place with one thread of torch, and gives the others back."""
 
 from __future__ import annotations
 
