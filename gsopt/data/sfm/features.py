@@ -75,7 +75,7 @@ class ViewGraph:
 
 
 def extract(project: ColmapProject, photos: Sequence[Photo], masks: Path | None, *, thorough: bool = False) -> None:
-    """Features of all photos, one camera for each lens, zoom and size.
+    """SIFT features of all photos (none with `--features xfeat`), one camera for each lens, zoom and size.
 
     `thorough` finds features again from 40 degrees to the side, at five times the cost: affine shapes (Mikolajczyk and
     Schmid 2004), descriptors pooled over sizes (Dong and Soatto 2015), and fainter features.
@@ -85,7 +85,7 @@ def extract(project: ColmapProject, photos: Sequence[Photo], masks: Path | None,
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = config.threads or -1
     options.max_image_size = config.max_size
-    options.sift.max_num_features = config.features * (THOROUGH_FACTOR if thorough else 1)
+    options.sift.max_num_features = config.max_features * (THOROUGH_FACTOR if thorough else 1)
     if thorough:
         options.sift.estimate_affine_shape = options.sift.domain_size_pooling = True
         options.sift.peak_threshold = FAINT_PEAK
@@ -96,6 +96,8 @@ def extract(project: ColmapProject, photos: Sequence[Photo], masks: Path | None,
         names = [photo.name for photo in shared]
         # Listed first, in order: threads that finish in any order would number the photos in any order.
         pycolmap.import_images(database, project.photos, pycolmap.CameraMode.SINGLE, names, reader)
+        if config.features == "xfeat":
+            continue
         pycolmap.extract_features(
             database,
             project.photos,

@@ -50,7 +50,8 @@ def _descriptors(project: ColmapProject, pairs: PairMatches) -> dict[int, Float[
     found = {}
     with project.opened() as db:
         for number in pairs.names:
-            rows = db.read_descriptors(number).data.astype(np.float32)
+            has = db.exists_descriptors(number)
+            rows = db.read_descriptors(number).data.astype(np.float32) if has else np.zeros((0, 128), np.float32)
             found[number] = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
     return found
 
@@ -116,6 +117,8 @@ def guided(
     limit: float,
 ) -> UInt32[np.ndarray, "M 2"]:
     """Mutual best matches within `limit` px of the epipolar line that are clearly better than the next best there."""
+    if not len(a) or not len(b):
+        return np.zeros((0, 2), np.uint32)
     lines = (_homogeneous(first) @ fundamental.T).astype(np.float32)
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
     far = np.abs(lines @ _homogeneous(second).T.astype(np.float32)) > limit

@@ -5,11 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
+from PIL import Image
 
+from gsopt.data.image_files import IMAGE_FORMATS
 from gsopt.data.sfm.features import ColmapProject
 
 MAX_RATIO = 0.85
@@ -24,6 +27,13 @@ BACKGROUND_SHIFT = 0.15
 BACKGROUND_ERROR = 0.012
 """Distance from the background's homography, as a share of the diagonal: things before the wall move a little more."""
 
+BACKGROUND_SPREAD = 0.02
+"""Farthest that a match of the background moves otherwise than all of it, as a share of the diagonal."""
+BACKGROUND_PARALLAX = 0.025
+"""Farthest that the background of one pair may move otherwise than all pairs together say, as a share of the diagonal:
+a hand-held camera moves a little. An object taken for it differed by 0.03 to 0.085."""
+SHIFT_STEPS = 10
+
 ImagePair = tuple[int, int]
 Points = Float[np.ndarray, "F 2"]
 Matches = UInt32[np.ndarray, "M 2"]
@@ -37,6 +47,8 @@ class PairMatches:
     sizes: dict[int, tuple[int, int]]
     keypoints: dict[int, Points]
     matches: dict[ImagePair, Matches]
+    turntable: bool = False
+    """True where a background at rest was left out."""
 
     def points(self, pair: ImagePair) -> tuple[Points, Points]:
         """Positions of the matches of a pair in both photos, px."""
@@ -81,19 +93,69 @@ def read_matches(project: ColmapProject) -> PairMatches:
     return PairMatches(names, sizes, keypoints, matches)
 
 
-def without_background(pycolmap: Any, pairs: PairMatches, seed: int) -> PairMatches | None:
+def inside(pairs: PairMatches, masks: Path) -> PairMatches:
+    """The matches whose two ends lie inside the masks; a photo without a mask counts everywhere."""
+    shows = {number: _shown(pairs, number, masks / f"{name}.png") for number, name in pairs.names.items()}
+    return pairs.kept({(a, b): shows[a][rows[:, 0]] & shows[b][rows[:, 1]] for (a, b), rows in pairs.matches.items()})
+
+
+def _shown(pairs: PairMatches, number: int, mask: Path) -> Any:
+    points = pairs.keypoints[number]
+    if not mask.is_file():
+        return np.ones(len(points), dtype=bool)
+    with Image.open(mask, formats=IMAGE_FORMATS) as image:
+        pixels = np.asarray(image.convert("L"))
+    columns = np.clip(points[:, 0].astype(int), 0, pixels.shape[1] - 1)
+    rows = np.clip(points[:, 1].astype(int), 0, pixels.shape[0] - 1)
+    return pixels[rows, columns] > 127
+
+
+def without_background(pycolmap: Any, pairs: PairMatches, seed: int, *, jointly: bool = False) -> PairMatches | None:
     """The matches that move, or None if behind them no background stands still in the picture.
 
     An object on a turntable before a fixed camera has such a background. It is most of what matches there, fits a
     camera that never moved, and would be reconstructed in place of the object. A homography close to the identity
     explains it in every pair of photos, also from opposite sides; a camera that walks around sees no such thing.
+    `jointly`, all pairs say together how the background of each photo is shifted, and one that disagrees is corrected.
     """
     compared = [pair for pair, rows in pairs.matches.items() if len(rows) >= BACKGROUND_MATCHES]
     still = {pair: _at_rest(pycolmap, *pairs.points(pair), pairs.sizes[pair[0]], seed) for pair in compared}
-    found = {pair: ~rows for pair, rows in still.items() if rows.any()}
+    found = {pair: rows for pair, rows in still.items() if rows.any()}
     if len(found) < 3 or len(found) < BACKGROUND_SHARE * len(compared):
         return None
-    return pairs.kept(found)
+    if not jointly:
+        return pairs.kept({pair: ~rows for pair, rows in found.items()})
+    shifts = _shifts(pairs, found)
+    moving = pairs.kept({pair: ~_background(pairs, pair, still[pair], shifts) for pair in compared})
+    return replace(moving, turntable=True)
+
+
+def _shifts(pairs: PairMatches, still: Mapping[ImagePair, Bool[np.ndarray, "M"]]) -> dict[int, Float[np.ndarray, "2"]]:
+    """Positions of the background in each photo, px, that fit all pairs with the least sum of distances.
+
+    One pair alone may take an object that turned a little for the background.
+    """
+    numbers = sorted(pairs.names)
+    signs = np.array([[(n == b) - (n == a) for n in numbers] for a, b in still], dtype=float)
+    moved = np.array([np.median(np.subtract(*pairs.points(pair)[::-1])[rows], axis=0) for pair, rows in still.items()])
+    weights = np.ones(len(signs))
+    for _ in range(SHIFT_STEPS):  # Weiszfeld's weights; the last row sets the mean to zero
+        system = np.vstack([signs * weights[:, None], np.ones(len(numbers))])
+        found = np.linalg.lstsq(system, np.vstack([moved * weights[:, None], np.zeros(2)]), rcond=None)[0]
+        weights = 1 / np.sqrt(np.maximum(np.linalg.norm(signs @ found - moved, axis=1), 1.0))
+    return dict(zip(numbers, found, strict=True))
+
+
+def _background(
+    pairs: PairMatches, pair: ImagePair, still: Bool[np.ndarray, "M"], shifts: Mapping[int, Float[np.ndarray, "2"]]
+) -> Bool[np.ndarray, "M"]:
+    """Marks what moves as the background of the two photos does, and the pair's own background where it is the same."""
+    moved = np.subtract(*pairs.points(pair)[::-1])
+    expected = shifts[pair[1]] - shifts[pair[0]]
+    diagonal = float(np.hypot(*pairs.sizes[pair[0]]))
+    apart = np.linalg.norm(moved - expected, axis=1) / diagonal
+    own = still.any() and np.linalg.norm(np.median(moved[still], axis=0) - expected) < BACKGROUND_PARALLAX * diagonal
+    return still | (apart < BACKGROUND_ERROR) if own else apart < BACKGROUND_SPREAD
 
 
 def _at_rest(pycolmap: Any, first: Points, second: Points, size: tuple[int, int], seed: int) -> Bool[np.ndarray, "M"]:

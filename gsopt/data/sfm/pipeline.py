@@ -26,6 +26,8 @@ from gsopt.data.sfm import diagnosis, features, few_photos, known_poses, mapping
 from gsopt.data.sfm.child_process import run_in_child
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
+from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, match_joined
+from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.masks import FeatureInput, prepare_masks
 from gsopt.data.sfm.overview_image import draw_scene
@@ -90,6 +92,7 @@ class _Run:
         self.pycolmap, self.source, self.work, self.config, self.report = pycolmap, source, work, config, report
         self.seconds: dict[str, float] = {}
         self.notes: list[str] = []
+        self.learned: LearnedMatches | None = None
 
     def posed(self) -> tuple[Path, Diagnosis]:
         """The finished scene folder inside the working folder, and its diagnosis."""
@@ -148,14 +151,27 @@ class _Run:
     ) -> tuple[ViewGraph, str]:
         names = [photo.name for photo in photos]
         matching = features.choose_matching(self.config, len(names), is_video(self.source))
+        matcher = None if self.config.features == "sift" else self._matcher(matching)
         with self._timed("features"):
             self.report(f"looking for features in {len(names)} photos (masks: {inputs.kind})")
             features.extract(project, photos, inputs.masks)
             if frames is not None:
                 known_poses.write_cameras(project, frames)
         with self._timed("matching"):
-            graph = features.match(project, names, matching, self.report)
-        return graph, matching
+            if matcher is None:
+                return features.match(project, names, matching, self.report), matching
+            folders, threads = (inputs.photos, inputs.masks), self.config.threads
+            self.learned = learned_matches(matcher, *folders, names, threads, self.report)
+            return match_joined(project, self.learned, inputs.masks), matching
+
+    def _matcher(self, matching: str) -> LearnedMatcher:
+        """The networks of learned features, for as many photos as can all be compared."""
+        if matching != "exhaustive":
+            raise UsageError(
+                f"`--features {self.config.features}` compares all photos with all, which {features.EXHAUSTIVE_UP_TO} "
+                "photos allow and a video does not. Give fewer photos, or drop the flag."
+            )
+        return LearnedMatcher()
 
     def _is_few(self, photos: list[Photo]) -> bool:
         """True where every photo is dear and nobody has chosen another way."""
@@ -178,7 +194,7 @@ class _Run:
         self.report(f"few photos with little in common: looking thoroughly for features (masks: {inputs.kind})")
         project = replace(project, database=self.work / "thorough.db")
         features.extract(project, photos, None, thorough=True)
-        hypotheses = few_photos.match_few(project, inputs.masks)
+        hypotheses = few_photos.match_few(project, inputs.masks, self.learned)
         again, graph_again = few_photos.find_few_poses(project, hypotheses.matches, self.report)
         if trust >= few_photos.MIN_OBSERVATIONS and placed >= (len(again.names) if again is not None else 0):
             return graph, mapped

@@ -12,6 +12,7 @@ Mapper = Literal["auto", "incremental", "global", "hybrid"]
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 CameraModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Poses = Literal["find", "prior"]
+Features = Literal["sift", "xfeat", "both"]
 
 MAX_SIDE = 20_000
 MAX_FEATURES = 65_536
@@ -37,8 +38,11 @@ class SfmConfig:
     """Focal length in pixels of the full-size photos, if known: it is kept. Read from EXIF when not given."""
     max_size: int = 1600
     """Features are looked for in a copy whose longer side is at most this, px."""
-    features: int = 4096
-    """Most features per photo."""
+    features: Features = "sift"
+    """sift; xfeat, learned features and a learned matcher (pip install 'gsopt[match]'), which find more on smooth
+    surfaces and from the side, at 3 s a pair; or both, joined before the geometry is verified."""
+    max_features: int = 4096
+    """Most SIFT features per photo."""
     frames: int = 150
     """Most frames taken from a video."""
     undistort: bool = True
@@ -53,7 +57,8 @@ class SfmConfig:
         check.one_of("--matching", self.matching, ("auto", "exhaustive", "sequential", "retrieval"))
         check.one_of("--poses", self.poses, ("find", "prior"))
         check.within("--max-size", self.max_size, 64, MAX_SIDE, "The default is 1600.")
-        check.within("--features", self.features, 64, MAX_FEATURES, "The default is 4096.")
+        check.one_of("--features", self.features, ("sift", "xfeat", "both"))
+        check.within("--max-features", self.max_features, 64, MAX_FEATURES, "The default is 4096.")
         check.within("--frames", self.frames, 3, 100_000, "The default is 150.")
         check.within("--seed", self.seed, 0, 2**31 - 1, "Give a whole number in that range.")
         check.at_least("--threads", self.threads, 0, "0 takes one thread per core.")
@@ -61,3 +66,7 @@ class SfmConfig:
             check.within("--focal", self.focal, 1.0, 1e6, "Drop the flag to read it from EXIF or to find it.")
         if self.focal is not None and self.poses == "prior":
             raise UsageError("`--focal` and `--poses prior` were both given. Keep one: the prior has its own focal.")
+        if self.features != "sift" and self.matching not in ("auto", "exhaustive"):
+            raise UsageError(
+                f"`--features {self.features}` compares all with all, got `--matching {self.matching}`. Drop one."
+            )

@@ -13,7 +13,7 @@ import textured_room as room
 from gsopt.data.sfm.pipeline import PosedScene, pose_photos
 from gsopt.data.sfm.settings import SfmConfig
 
-QUICK = SfmConfig(features=1200, threads=1)
+QUICK = SfmConfig(max_features=1200, threads=1)
 
 
 @pytest.fixture(scope="session")

@@ -54,6 +54,17 @@ def test_of_an_object_on_a_turntable_the_background_is_left_out() -> None:
         assert (rows[:, 0] < OBJECT_POINTS).sum() > 0.6 * OBJECT_POINTS  # its axis stands still too
 
 
+def test_of_an_object_that_turned_a_little_the_object_is_kept() -> None:
+    """Between two neighbors the object, with more features than the wall, moves hardly more than the wall does."""
+    shown = photos(wall_turns=False, count=6, step=6.0)
+    few = {pair: rows[: OBJECT_POINTS + 20] if pair[1] == pair[0] + 1 else rows for pair, rows in shown.matches.items()}
+    shaken = {n: points + np.array([12.0 * (n % 3), 0]) for n, points in shown.keypoints.items()}
+    moving = without_background(pycolmap, replace(shown, keypoints=shaken, matches=few), seed=0, jointly=True)
+    assert moving is not None
+    for rows in moving.matches.values():
+        assert (rows[:, 0] >= OBJECT_POINTS).sum() == 0
+
+
 def test_a_camera_that_walks_has_no_background_at_rest() -> None:
     assert without_background(pycolmap, photos(wall_turns=True), seed=0) is None
 
