@@ -54,7 +54,7 @@ class RunConsole:
                 self._begin(event)
             case "warning":
                 self.say(f"warning: {event['message']}")
-            case "guidance" | "library" | "shape_prior" as kind:
+            case "guidance" | "library" | "shape_prior" | "cells" as kind:
                 self.say(f"{kind.replace('_', ' ')}: {event['message']}")
             case "progress":
                 self._progress(event)

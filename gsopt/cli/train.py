@@ -16,7 +16,7 @@ from gsopt.errors import UsageError
 RUNS = Path("runs")
 
 # Flags that may stand beside --resume when DATA does not: they choose where and how fast, not what.
-WITH_RESUME = ("run", "resume", "vgg", "threads", "max_memory", "checkpoint_every", "preview_every")
+WITH_RESUME = ("run", "resume", "vgg", "farm", "threads", "max_memory", "checkpoint_every", "preview_every")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -30,12 +30,12 @@ def main(argv: Sequence[str]) -> int:
 
         console = RunConsole(run)
         try:
-            result = reconstruct(
-                None, run, config=config, resume=flags.resume, vgg=flags.vgg, on_progress=console, log=console.say
-            )
+            how: dict[str, Any] = {"resume": flags.resume, "vgg": flags.vgg, "farm": flags.farm}
+            result = reconstruct(None, run, config=config, on_progress=console, log=console.say, **how)
             console.close()
             if result.metrics is None:
-                console.say(f"splats so far: {run / 'splat.ply'}")
+                if (run / "splat.ply").is_file():
+                    console.say(f"splats so far: {run / 'splat.ply'}")
             else:
                 console.say(summary(result.metrics))
                 console.say(f"report: {result.report}")

@@ -52,6 +52,7 @@ FLAGS = {
     "guidance.ref_image": "--ref-image FILE",
     "poses.refine": "--refine-poses",
     "exposure.learn": "--exposure",
+    "cells": "--cells auto|N",
     "max_memory": "--max-memory 8GB",
 }
 """Flag, short form and metavar of a setting; every other one is its own flag: --optimizer.lr-last."""
@@ -76,6 +77,8 @@ class Flags:
     """Also compute LPIPS (VGG) on the held-out views, at many times the cost of the rest; needs its weights."""
     white_background: Annotated[bool, arg(aliases=["-w"])] = False
     """The same as --background white."""
+    farm: Annotated[str, arg(metavar="local[:CORES]|ray[://HOST:PORT]")] = "local"
+    """Machines of the runs of `--cells`; one at a time on this one when not given."""
     settings: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
 
 

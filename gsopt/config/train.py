@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from gsopt import check
 from gsopt.check import Within
 from gsopt.config.bounds import MAX_WEIGHT, Count, Decay, PositiveCount, ShDegree, Threads, Weight
+from gsopt.config.cells import CellConfig, check_cells
 from gsopt.config.from_json import build
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.presets import Preset, with_preset
@@ -283,6 +284,7 @@ class TrainConfig:
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     poses: PoseConfig = field(default_factory=PoseConfig)
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
+    cell: CellConfig = field(default_factory=CellConfig)
     preset: Preset = "default"
     """draft: 2000 steps with more skips; default: 7000 steps; high: 15,000 steps. Other settings win over it."""
     iterations: PositiveCount = 7000
@@ -299,6 +301,9 @@ class TrainConfig:
     max_memory: str = ""
     """Memory that a run on the CPU may need, as 8GB; one that is estimated to need more is refused before its first
     step. Left open, the memory that is free."""
+    cells: str = ""
+    """Learn a big scene in so many cells, one after the other or on a farm, each beside a frozen coarse model of the
+    rest; auto: as few as fit into memory."""
     antialiased: bool = False
     """Mip-Splatting's 2D filter."""
     checkpoint_every: Count = 1000
@@ -309,6 +314,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check.fields(self)
         check.device(self.device)
+        check_cells(self.cells)
         if self.max_memory:
             check.byte_count("--max-memory", self.max_memory)
 

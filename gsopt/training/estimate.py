@@ -19,8 +19,10 @@ from gsopt.training.targets import content_pixels
 
 BASE_BYTES = 340_000_000
 """The interpreter with torch and the evaluation's networks."""
-COPIES = 8
-"""Parameters, gradients, two moments, and what growing takes while rows are added."""
+COPIES, STILL_COPIES = 8, 5
+"""Parameters, gradients, two moments, and what growing takes while rows are added, or only their first state."""
+FROZEN_COPIES = 3
+"""Frozen Gaussians: themselves, beside those of the run, and gradients that nobody uses."""
 SPLAT_BYTES = 700
 """A splat in the kernels' buffers and lists of tiles."""
 PIXEL_BYTES = 120
@@ -40,16 +42,18 @@ class Estimate:
     """Bytes of each."""
     image_bytes: int
     seconds: float
+    frozen_bytes: int = 0
+    """Bytes of Gaussians that are drawn and stay as they are."""
 
     @property
     def memory(self) -> int:
-        return BASE_BYTES + self.gaussians * self.gaussian_bytes + self.image_bytes
+        return BASE_BYTES + self.gaussians * self.gaussian_bytes + self.image_bytes + self.frozen_bytes
 
     def require(self, limit: int) -> None:
         """Raises InputError, with what to change, where `limit` bytes do not suffice."""
         if self.memory <= limit:
             return
-        room = (limit - BASE_BYTES - self.image_bytes) // self.gaussian_bytes
+        room = (limit - self.memory) // self.gaussian_bytes + self.gaussians
         fewer = f"--max-gaussians {room // 1000 * 1000}, " if room >= 1000 else ""
         raise InputError(
             f"This run needs about {gigabytes(self.memory)} ({gigabytes(self.gaussians * self.gaussian_bytes)} for "
@@ -58,25 +62,35 @@ class Estimate:
         )
 
 
-def estimate(config: TrainConfig, plan: RunPlan, scene: Scene) -> Estimate:
-    """The estimate for a run on the CPU."""
+def estimate(config: TrainConfig, plan: RunPlan, scene: Scene, frozen: int = 0) -> Estimate:
+    """The estimate for a run on the CPU that draws so many frozen Gaussians with its own."""
     steps, budget = plan.schedule.iterations, plan.density.max_gaussians
     expected = max(default_budget(content_pixels(scene.train), steps), config.init.count or 0)
-    count = budget if plan.density.strategy == "mcmc" else min(budget, expected)
+    full = plan.density.strategy == "mcmc" or config.cell.start
+    pixels = max(view.camera.width * view.camera.height for view in scene.drawn)
+    count, images = budget if full else min(budget, expected), image_bytes(config, plan, scene)
+    return of_sizes(count, plan.schedule.max_sh_degree, pixels, images, steps, frozen, plan.schedule.refine_stop > 0)
+
+
+def image_bytes(config: TrainConfig, plan: RunPlan, scene: Scene) -> int:
+    """Bytes of decoded images and of targets that a run keeps."""
     channels = 4 if scene.has_alpha else 3
     sizes = [view.camera.width * view.camera.height for view in scene.drawn]
     decoded = channels * (sum(sizes) + sum(view.camera.width * view.camera.height for view in scene.test))
     targets = min(int(plan.target_cache_mb * MEBIBYTE), 4 * channels * sum(sizes))
-    return of_sizes(
-        count, plan.schedule.max_sh_degree, max(sizes), min(decoded, config.data.cache_mb * MEBIBYTE) + targets, steps
-    )
+    return min(decoded, config.data.cache_mb * MEBIBYTE) + targets
 
 
-def of_sizes(gaussians: int, sh_degree: int, pixels: int, images: int, steps: int) -> Estimate:
-    """The estimate for `gaussians` drawn into `pixels`, beside `images` bytes of photos and targets."""
-    floats = 11 + 3 * (sh_degree + 1) ** 2
-    seconds = steps * (SECONDS_PER_PIXEL * pixels + SECONDS_PER_GAUSSIAN * gaussians)
-    return Estimate(gaussians, 4 * floats * COPIES + SPLAT_BYTES, images + pixels * PIXEL_BYTES, seconds)
+def of_sizes(
+    gaussians: int, sh_degree: int, pixels: int, images: int, steps: int, frozen: int = 0, growing: bool = True
+) -> Estimate:
+    """The estimate for `gaussians` and `frozen` ones drawn into `pixels`, beside `images` bytes of photos and targets;
+    `growing`: Gaussians are added and removed."""
+    row = 4 * (11 + 3 * (sh_degree + 1) ** 2)
+    each = row * (COPIES if growing else STILL_COPIES) + SPLAT_BYTES
+    seconds = steps * (SECONDS_PER_PIXEL * pixels + SECONDS_PER_GAUSSIAN * (gaussians + frozen))
+    beside = frozen * (row * FROZEN_COPIES + SPLAT_BYTES)
+    return Estimate(gaussians, each, images + pixels * PIXEL_BYTES, seconds, beside)
 
 
 def memory_limit(config: TrainConfig) -> int | None:

@@ -16,8 +16,9 @@ import torch
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene, View
-from gsopt.errors import InputError, NumericalError
+from gsopt.errors import InputError, NumericalError, UsageError
 from gsopt.events import to_json, write_atomic
+from gsopt.formats import load_splats
 from gsopt.formats.ply import save_ply
 from gsopt.gaussians import Gaussians
 from gsopt.init.first_gaussians import ENOUGH_AGREED, first_gaussians
@@ -36,6 +37,7 @@ from gsopt.training.interrupt import StopRequest
 from gsopt.training.mirror_images import with_recorded_mirrors
 from gsopt.training.plan import RunPlan, guesses, matches_photos
 from gsopt.training.run_directory import Listener, RunDirectory, opened
+from gsopt.training.surroundings import Surrounded, narrowed, surrounded
 from gsopt.training.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -81,6 +83,8 @@ def train(
     Raises UsageError for a folder that holds another run, InputError for unusable data, NumericalError when a value
     stops being finite.
     """
+    if config.cells:
+        raise UsageError(f"`--cells {config.cells}` is for `gsopt train` and reconstruct(), got it here. Leave it out.")
     began = time.process_time()
     with opened(Path(run), config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
         backend = make_backend(config.backend, config.threads, config.device)
@@ -97,6 +101,7 @@ def train(
 
                 scene = with_stereo_depths(scene, ENOUGH_AGREED, config.seed)
             plan = RunPlan.of(config, scene)
+            scene, backend = narrowed(plan.cell, scene), surrounded(plan, backend)
             guidance = _guidance(config, plan, scene, backend, directory)
             expected = require_memory(config, plan, scene, backend, guidance)
             directory.record(estimate=expected)
@@ -167,7 +172,7 @@ def require_memory(
     Returns the estimate of memory, and on the CPU without guidance of the time, or None for the reference.
     """
     if backend.name == "cpu":
-        expected = estimate(config, plan, scene)
+        expected = estimate(config, plan, scene, len(backend) if isinstance(backend, Surrounded) else 0)
         if (limit := memory_limit(config)) is not None:
             expected.require(limit)
         found: dict[str, float] = {"memory_mb": round(expected.memory / 1e6)}
@@ -239,7 +244,10 @@ def _start(
     names = [view.name for view in scene.train]
     checkpoint = load_newest(directory.checkpoints, directory.warn)
     if checkpoint is None:
-        gaussians, init = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
+        if plan.cell.start:
+            gaussians, init = load_splats(plan.cell.start), f"splats of {plan.cell.start}"
+        else:
+            gaussians, init = first_gaussians(scene, plan.init, plan.schedule.max_sh_degree, plan.seed)
         if len(gaussians) == 0:
             raise InputError(f"`{init}` made no Gaussians. Choose another --init.")
         directory.record(gaussians_init=init, train_views=names, origin=list(scene.origin), plan=plan.to_dict())

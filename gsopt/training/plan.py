@@ -7,6 +7,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from gsopt.config.cells import CellConfig
 from gsopt.config.train import DensityConfig, ExposureConfig, InitConfig, PoseConfig, SparseConfig, TrainConfig
 from gsopt.data.background import Background
 from gsopt.data.scene import Scene
@@ -82,6 +83,7 @@ class RunPlan:
     background: Background
     antialiased: bool
     init: InitConfig
+    cell: CellConfig
     weights: LossWeights
     schedule: Schedule
     density: DensityPlan
@@ -117,6 +119,7 @@ class RunPlan:
             background=background,
             antialiased=config.antialiased,
             init=config.init,
+            cell=config.cell,
             weights=loss_weights(config, sparse, scene.has_alpha),
             schedule=schedule,
             density=density_plan(config.density, budget, scene.extent),

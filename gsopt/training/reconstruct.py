@@ -20,7 +20,7 @@ from gsopt.init.cut_out import require_mask_model, with_made_masks
 from gsopt.results.evaluation import OnView, evaluate, networks, read_metrics
 from gsopt.training.interrupt import Stopped, StopRequest
 from gsopt.training.loop import PROGRESS_SECONDS, TrainResult, train
-from gsopt.training.run_directory import Listener, RunDirectory, opened, refuse_another_run
+from gsopt.training.run_directory import Listener, RunDirectory, first_difference, opened, refuse_another_run
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ def reconstruct(
     config: TrainConfig | None = None,
     resume: bool = False,
     vgg: bool = False,
+    farm: str = "local",
     on_progress: Listener | None = None,
     log: Report = lambda line: None,
     **settings: Any,
@@ -51,12 +52,14 @@ def reconstruct(
 
     `data`: a dataset, a folder of photos, a video, a DataConfig, or None for that of `config` or, with `resume`, the
     settings in `run`. `settings`: fields of TrainConfig, a section as a dict: `preset="draft"`,
-    `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `vgg`: LPIPS by VGG too. `on_progress` is called
+    `guidance={"prompt": ["a red chair"]}`; or give a whole `config`. `vgg`: LPIPS by VGG too. `farm`: where the runs of
+    `cells` go. `on_progress` is called
     with every event, `log` with lines for people. Raises a GsoptError; a wrong setting, prompt or prior, an unreadable
     held-out image, missing weights or a missing mask model raise it before any work.
     """
     run = Path(run)
     config = _with_absolute_paths(_configured(data, run, config, resume, settings))
+    resume = resume or goes_on(config, run)
     if not resume:
         refuse_another_run(run)
         _require_prior(config.guidance)
@@ -65,12 +68,24 @@ def reconstruct(
     read_metrics(run)
     config = _with_masks(_with_poses(config, run, log), run, log)
     with StopRequest(run / "stop") as stop:
-        result = train(config, run, resume=resume, on_progress=on_progress, done=False)
+        if config.cells:
+            from gsopt.training.cells.run import train_in_cells
+
+            result = train_in_cells(config, run, farm, resume=resume, on_progress=on_progress)
+        else:
+            result = train(config, run, resume=resume, on_progress=on_progress, done=False)
         if result.stopped:
             return Reconstruction(result.run, result.gaussians, None, None)
         log(f"trained in {timedelta(seconds=round(result.train_seconds))}; evaluating {result.run / 'splat.ply'}")
         metrics, report = _evaluated(config, result, vgg, on_progress, stop)
     return Reconstruction(result.run, result.gaussians, metrics, report)
+
+
+def goes_on(config: TrainConfig, run: Path) -> bool:
+    """True when the folder holds a run in cells with the same settings: the same command goes on with it."""
+    if not config.cells or not (run / "config.json").is_file():
+        return False
+    return first_difference(TrainConfig.read(run / "config.json").to_dict(), config.to_dict()) is None
 
 
 def _configured(

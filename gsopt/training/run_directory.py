@@ -19,7 +19,15 @@ from gsopt.events import EventWriter, refuse_links, to_json, write_atomic
 Listener = Callable[[Mapping[str, Any]], None]
 
 # What a run leaves behind that must not be lost. A folder with config.json, events and a log alone holds no work.
-WORK = ("splat.ply", "metrics.json", "report.html", "previews/*", "checkpoints/*.safetensors")
+WORK = (
+    "splat.ply",
+    "metrics.json",
+    "report.html",
+    "plan.json",
+    "previews/*",
+    "checkpoints/*.safetensors",
+    "coarse/checkpoints/*.safetensors",
+)
 # Settings that may differ when a run is resumed: they do not change a bit of the result, but for backend and device, of
 # which each has bits of its own: a run must not be lost with its GPU.
 FREE = ("threads", "max_memory", "checkpoint_every", "preview_every", "data.cache_mb", "backend", "device")

@@ -19,6 +19,7 @@ from tiny_scenes import write_dataset
 
 from gsopt.benchmark.suite import definition, result_file, runner
 from gsopt.benchmark.suite.single_run import SuiteContext
+from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError, MissingDependency, UsageError
 from gsopt.farm import ray_farm
 from gsopt.farm.job import Job, Outcome
@@ -27,6 +28,8 @@ from gsopt.farm.open import open_farm
 from gsopt.farm.ray_farm import RayFarm
 from gsopt.many_scenes.scenes import read_scenes
 from gsopt.many_scenes.train_scenes import Limits, train_scenes
+from gsopt.training.cells import run as cells_run
+from gsopt.training.cells.run import train_in_cells
 
 pytestmark = pytest.mark.xdist_group("ray")
 
@@ -217,6 +220,22 @@ def test_scenes_are_trained_to_the_same_bits_as_on_this_machine(cluster: Any, tm
         assert [record["state"] for record in found] == ["done", "done"], found
     splats = [(out / name / "splat.ply").read_bytes() for out in runs for name in ("a", "b")]
     assert len(set(splats)) == 1
+
+
+def test_a_scene_in_cells_has_the_same_bits_as_on_this_machine(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = write_dataset(tmp_path / "cloud")
+    few = {"density": {"max_gaussians": 90}, "init": {"method": "random", "count": 60}, "sparse": {"below_views": 0}}
+    config = TrainConfig.of(iterations=16, cells="2", threads=1, data={"path": str(data)}, **few)
+    monkeypatch.setattr(cells_run, "open_farm", lambda name, cpus: LocalFarm(2) if name == "local" else RayFarm())
+    for name in ("local", "ray"):
+        train_in_cells(config, tmp_path / name, name)
+    plans, splats = (
+        [(tmp_path / name / file).read_bytes() for name in ("local", "ray")] for file in ("plan.json", "splat.ply")
+    )
+    assert plans[0] == plans[1]
+    assert splats[0] == splats[1]
 
 
 def test_a_suite_has_the_same_figures_as_on_this_machine(cluster: Any, tmp_path: Path) -> None:

@@ -1,0 +1,146 @@
+"""Laws of the cells: they part the ground without gaps, hold equally many Gaussians, and their plan is not trusted."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_scenes import cloud, tiny_config, write_dataset
+
+from gsopt.config.train import DensityConfig, SparseConfig, TrainConfig
+from gsopt.data.scene import load_scene
+from gsopt.errors import InputError, UsageError
+from gsopt.formats.ply import save_ply
+from gsopt.raster.api import make_backend
+from gsopt.training.cells.divide import divide, ground_axes, relevant, split
+from gsopt.training.cells.plan import Cell, CellPlan, read_plan, sha256
+from gsopt.training.cells.size import cell_sizes
+from gsopt.training.plan import RunPlan
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("cells") / "cloud", train=6, test=1)
+
+
+def big(data: Path, **changes: Any) -> TrainConfig:
+    """A run that is not one of few views."""
+    return replace(tiny_config(data), sparse=SparseConfig(below_views=0), **changes)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 7])
+def test_cells_cover_the_plane_once_and_hold_equally_many(count: int) -> None:
+    places = torch.randn(700, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(count)) * 3
+    cells = [Cell("", *box, (0.5, 0.5), (), 1) for box in split(places, count)]
+    anywhere = torch.cat([places, 1e6 * places, torch.tensor([box.low for box in cells if math.isfinite(box.low[0])])])
+    inside = torch.stack([cell.holds(anywhere) for cell in cells])
+    assert (inside.sum(0) == 1).all()
+    held = inside[:, :700].sum(1)
+    assert int(held.max() - held.min()) <= math.ceil(math.log2(count))  # a rounding per halving
+    assert all(bool((cell.holds(anywhere, wide=True) | ~cell.holds(anywhere)).all()) for cell in cells)
+
+
+def test_a_model_of_fewer_places_than_cells_is_refused() -> None:
+    for places in (torch.zeros(9, 2), torch.zeros(0, 2), torch.rand(3, 2)):
+        with pytest.raises(InputError, match="Lower --cells"):
+            split(places.double(), 4)
+
+
+def test_a_view_belongs_to_the_cells_that_draw_it_and_no_cell_goes_without() -> None:
+    shares = torch.tensor([0.5, 0.04, 0.06] * 4)
+    assert relevant(shares).tolist() == [True, False, True] * 4
+    few = torch.linspace(0, 0.04, 20)
+    assert relevant(few).nonzero()[:, 0].tolist() == list(range(12, 20))
+
+
+def test_a_scene_is_divided_by_what_its_views_see(data: Path) -> None:
+    scene, coarse = load_scene(str(data)), cloud(80, 4)
+    found = divide(coarse, "0" * 64, scene.train, make_backend("cpu", 1), 2, 1000)
+    places = found.plan.places(coarse.means)
+    wide = [cell.holds(places, wide=True) for cell in found.plan.cells]
+    assert all(bool(~(inside & outside).any()) for inside, outside in zip(wide, found.surroundings, strict=True))
+    assert all(
+        cell.max_gaussians == math.ceil(1000 * int(w.sum()) / 80)
+        for cell, w in zip(found.plan.cells, wide, strict=True)
+    )
+    assert all(set(cell.views) <= {view.name for view in scene.train} and cell.views for cell in found.plan.cells)
+    axes = ground_axes(scene.train)
+    assert torch.allclose(axes @ axes.T, torch.eye(2, dtype=torch.float64), atol=1e-6)
+    assert float(axes[:, 2].abs().max()) < 0.1  # the cameras stand around the z axis
+
+
+HOSTILE: dict[str, Any] = {
+    "another version": lambda d: d.update(version=2),
+    "no version": lambda d: d.pop("version"),
+    "another coarse run": lambda d: d.update(coarse="0" * 64),
+    "one cell less": lambda d: d["cells"].pop(),
+    "no list of cells": lambda d: d.update(cells=3),
+    "a cell as text": lambda d: d["cells"].__setitem__(0, "x"),
+    "a view of another scene": lambda d: d["cells"][0].update(views=["../../secret.png"]),
+    "views as text": lambda d: d["cells"][0].update(views="r_0.png"),
+    "no views": lambda d: d["cells"][0].update(views=[]),
+    "no Gaussians": lambda d: d["cells"][0].update(max_gaussians=0),
+    "Gaussians as text": lambda d: d["cells"][0].update(max_gaussians="9"),
+    "a bound as text": lambda d: d["cells"][0].update(low=["a", None]),
+    "three bounds": lambda d: d["cells"][0].update(low=[0, 0, 0]),
+    "a bound of 400 digits": lambda d: d["cells"][0].update(high=[10**400, None]),
+    "a margin that is none": lambda d: d["cells"][0].update(margin=[math.nan, 0]),
+    "one axis": lambda d: d["ground"].pop(),
+    "an axis of two": lambda d: d["ground"].__setitem__(0, [1, 0]),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_plan_is_one_clear_line(name: str, tmp_path: Path) -> None:
+    coarse, path = tmp_path / "coarse.ply", tmp_path / "plan.json"
+    save_ply(coarse, cloud(5, 1))
+    cells = (
+        Cell("00", (-math.inf, -math.inf), (0.1, math.inf), (0.2, 0.3), ("a", "b"), 7),
+        Cell("01", (0.1, -math.inf), (math.inf, math.inf), (0.2, 0.3), ("b",), 8),
+    )
+    plan = CellPlan(sha256(coarse), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), cells)
+    plan.write(path)
+    assert read_plan(path, coarse, {"a": 1, "b": 1}, 2) == plan
+    document = json.loads(path.read_text())
+    HOSTILE[name](document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"plan\.json does not fit this run: [^\n]*Remove it") as refusal:
+        read_plan(path, coarse, {"a": 1, "b": 1}, 2)
+    assert "\n" not in str(refusal.value)
+
+
+def sizes(config: TrainConfig) -> Any:
+    scene = load_scene(config.data)
+    return cell_sizes(config, RunPlan.of(config, scene), scene)
+
+
+def test_cells_that_make_no_sense_are_refused(data: Path) -> None:
+    with pytest.raises(UsageError, match="few enough for one run"):
+        sizes(replace(tiny_config(data), cells="2"))
+    with pytest.raises(UsageError, match="at most the 6 input views, got 7"):
+        sizes(big(data, cells="7"))
+    one = big(data, cells="2")
+    with pytest.raises(UsageError, match="at most the 1 input views"):
+        sizes(replace(one, data=replace(one.data, views=1)))
+
+
+def test_cells_that_do_not_fit_are_refused_with_what_would(data: Path) -> None:
+    huge = big(data, cells="2", density=DensityConfig(max_gaussians=1_000_000))
+    with pytest.raises(
+        InputError, match=r"2 cells need about 2\.\d GB each, there are 1\.2 GB. Give --cells (\d), "
+    ) as refusal:
+        sizes(replace(huge, max_memory="1.2GB"))
+    enough = str(refusal.value).split("--cells ")[1][0]
+    found = sizes(replace(huge, cells=enough, max_memory="1.2GB"))
+    assert found.cell.memory <= 1.2e9 < found.polish.memory
+    assert not found.polished
+    assert "no joint polish" in str(found)
+    assert sizes(replace(huge, cells="auto", max_memory="1.2GB")).count == int(enough)
+    assert sizes(replace(huge, cells="auto", max_memory="9GB")).count == 2
+    with pytest.raises(InputError, match="fewer Gaussians"):
+        sizes(replace(huge, cells="auto", max_memory="350MB"))
