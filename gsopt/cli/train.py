@@ -24,6 +24,8 @@ def main(argv: Sequence[str]) -> int:
     with flags_in_errors():
         flags = parse(argv)
         config, run = read_flags(flags)
+        if flags.farm != Flags().farm and not config.cells:
+            raise UsageError(f"`--farm` is for runs in cells, got {flags.farm} without. Add --cells auto, or drop it.")
 
         from gsopt.cli.console import RunConsole
         from gsopt.training.reconstruct import reconstruct

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -378,6 +379,9 @@ def _last_good(directory: RunDirectory) -> Path | None:
 
 def peak_memory_mb() -> float | None:
     """Largest resident set of this process so far, MB (10^6 bytes)."""
+    with contextlib.suppress(OSError, ValueError, StopIteration):  # Linux; getrusage counts the parent's memory too
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
     try:
         import resource
     except ImportError:

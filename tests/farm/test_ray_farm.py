@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from gsopt.farm.ray_farm import RayFarm
 from gsopt.many_scenes.scenes import read_scenes
 from gsopt.many_scenes.train_scenes import Limits, train_scenes
 from gsopt.training.cells import run as cells_run
+from gsopt.training.cells import worker
 from gsopt.training.cells.run import train_in_cells
 
 pytestmark = pytest.mark.xdist_group("ray")
@@ -53,6 +55,13 @@ out = Path({out!r})
 for outcome in farm.run([job("a", folder=out / "a"), job("b", "hang", out / "b", pids={pids!r})]):
     print(outcome.job.name, flush=True)
 """
+
+
+class InProcess:
+    """A farm whose jobs take no seconds to start."""
+
+    def run(self, jobs: list[Job]) -> Iterator[Outcome]:
+        return (Outcome(one, "done", worker.handle(one.request)) for one in jobs)
 
 
 def by_name(farm: Any, *jobs: Job) -> dict[str, Outcome]:
@@ -228,8 +237,8 @@ def test_a_scene_in_cells_has_the_same_bits_as_on_this_machine(
     data = write_dataset(tmp_path / "cloud")
     few = {"density": {"max_gaussians": 90}, "init": {"method": "random", "count": 60}, "sparse": {"below_views": 0}}
     config = TrainConfig.of(iterations=16, cells="2", threads=1, data={"path": str(data)}, **few)
-    monkeypatch.setattr(cells_run, "open_farm", lambda name, cpus: LocalFarm(2) if name == "local" else RayFarm())
-    for name in ("local", "ray"):
+    for name, farm in (("local", InProcess()), ("ray", RayFarm())):
+        monkeypatch.setattr(cells_run, "open_farm", lambda name, cpus, farm=farm: farm)
         train_in_cells(config, tmp_path / name, name)
     plans, splats = (
         [(tmp_path / name / file).read_bytes() for name in ("local", "ray")] for file in ("plan.json", "splat.ply")

@@ -197,6 +197,17 @@ def test_what_does_not_go_with_cells_is_refused(
     assert f"`--cells` and `{flags[0]}" in capsys.readouterr().err
 
 
+def test_a_farm_without_cells_or_an_unknown_one_is_refused(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", str(data), "-m", str(tmp_path / "run"), "--farm"]
+    assert cli.main([*words, "local:2"]) == UsageError.exit_code
+    assert "`--farm` is for runs in cells" in capsys.readouterr().err
+    assert cli.main([*words, "slurm", "--cells", "2"]) == UsageError.exit_code
+    assert "`--farm` must be local" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_few_photos_are_refused_before_any_work(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for flags in (["--cells", "2"], ["--cells", "auto", "--views", "1"]):
         assert cli.main(["train", str(data), "-m", str(tmp_path / "run"), *flags]) == UsageError.exit_code

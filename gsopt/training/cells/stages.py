@@ -63,9 +63,10 @@ def polish_stage(config: TrainConfig, gaussians: int, run: Path) -> Stage:
 
 
 def _changed(config: TrainConfig, share: float, max_gaussians: int) -> TrainConfig:
-    """The same with a share of the steps, and so many Gaussians at most."""
+    """The same with a share of the steps, those before the first Gaussians are added too, and so many at most."""
     steps = max(1, math.ceil(share * config.iterations))
-    density = replace(config.density, max_gaussians=max_gaussians)
+    start = math.ceil(share * config.density.refine_start)
+    density = replace(config.density, max_gaussians=max_gaussians, refine_start=start)
     every = max(1, math.ceil(share * config.optimizer.sh_degree_every))
     optimizer = replace(config.optimizer, sh_degree_every=every)
     return replace(config.with_steps(steps), cells="", density=density, optimizer=optimizer)
