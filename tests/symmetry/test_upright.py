@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -47,12 +48,31 @@ def test_the_axis_of_a_round_thing_is_found(views: int, tmp_path: Path) -> None:
     assert found.colored
 
 
-def test_a_hexagon_is_not_round_but_has_its_axis(tmp_path: Path) -> None:
-    angles = [2 * math.pi * corner / 6 for corner in range(6)]
-    crown = [Ball((0.7 * math.cos(a), 0.7 * math.sin(a), 0.0), 0.2) for a in angles]
-    (found,) = find_symmetries(scene_of(tmp_path / "crown", crown, 2))
-    assert isinstance(found.element, Axis)
-    assert found.element.turns == 6
+def crown(corners: int, height: float = 0.0) -> list[Ball]:
+    """Balls at the corners of a polygon; the first one higher than the others."""
+    angles = [2 * math.pi * corner / corners + 0.1 for corner in range(corners)]
+    heights = [height] + [0.0] * (corners - 1)
+    return [Ball((0.7 * math.cos(a), 0.7 * math.sin(a), h), 0.2) for a, h in zip(angles, heights, strict=True)]
+
+
+@pytest.mark.parametrize(("corners", "views"), [(6, 2), (4, 2), (4, 3)])
+def test_a_hexagon_and_a_square_are_not_round_but_have_their_axis(corners: int, views: int, tmp_path: Path) -> None:
+    axis, *mirrors = find_symmetries(scene_of(tmp_path / "crown", crown(corners), views))
+    assert isinstance(axis.element, Axis)
+    assert axis.element.turns == corners
+    normals = [one.element.normal for one in mirrors if isinstance(one.element, Mirror)]
+    assert len(normals) == len(mirrors)
+    assert (len(normals) > 1) == (views == 3)  # two photos would prove false ones
+    for a, b in itertools.combinations(normals, 2):
+        steps = math.degrees(math.acos(min(1.0, abs(float(a @ b))))) / (180 / corners)
+        assert round(steps) > 0
+        assert steps == pytest.approx(round(steps), abs=0.05)
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_a_square_with_one_corner_higher_has_no_axis(views: int, tmp_path: Path) -> None:
+    found = find_symmetries(scene_of(tmp_path / "crown", crown(4, height=0.15), views))
+    assert not any(isinstance(symmetry.element, Axis) for symmetry in found)
 
 
 @pytest.mark.parametrize("views", [1, 2, 3])
