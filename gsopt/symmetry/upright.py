@@ -2,7 +2,7 @@
 
 So few outlines fit many planes: of those that miss by little most are false. But things stand upright, and so do
 their axes and mirrors. An axis then has two numbers to find, as has a plane, which may tilt a little, because the
-world may; and the true ones miss by less than a tenth of what others do (docs/decisions/0011-upright.md).
+world may; and the true ones miss by less than others do (docs/decisions/0011-upright.md).
 """
 
 from __future__ import annotations
