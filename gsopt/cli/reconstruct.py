@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from gsopt.config.bounds import Features
 from gsopt.config.presets import Preset
 
 
@@ -26,6 +27,9 @@ class Flags:
     """auto: those of PHOTOS, else made by the mask model; none for a scene rather than an object."""
     mask_model: Annotated[Path | None, arg(metavar="FILE")] = None
     """ONNX file of the mask model; by default $GSOPT_MASK_MODEL, else one that rembg has fetched."""
+    features: Features = "sift"
+    """Features that poses are found from: sift; xfeat, learned ones (pip install 'gsopt[match]'); or both, for few
+    photos of smooth things."""
     preset: Preset = "default"
     """draft: 2000 steps; default: 7000 steps; high: 15,000 steps; fewer for few photos."""
     eval: bool = False
@@ -47,7 +51,7 @@ def train_arguments(flags: Flags) -> list[str]:
     """The words of `gsopt train`; a run that has begun is resumed."""
     run = flags.run or Path("runs") / flags.photos.expanduser().absolute().stem
     words = [str(flags.photos), "-m", str(run), "--masks", flags.masks, "--preset", flags.preset]
-    words += ["--threads", str(flags.threads)]
+    words += ["--features", flags.features, "--threads", str(flags.threads)]
     words += ["--mask-model", str(flags.mask_model)] if flags.mask_model else []
     words += ["--eval"] if flags.eval else []
     return words + (["--resume"] if (run / "config.json").is_file() else [])

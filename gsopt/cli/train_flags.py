@@ -32,6 +32,7 @@ FLAGS = {
     "iterations": "--iterations N",
     "data.masks": "--masks given|auto|none|DIR",
     "data.mask_model": "--mask-model FILE",
+    "data.features": "--features",
     "data.depth": "--depth DIR",
     "data.depth_kind": "--depth-kind",
     "data.views": "--views N",

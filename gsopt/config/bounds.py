@@ -1,8 +1,8 @@
-"""Types of settings with their bounds."""
+"""Types of settings with their bounds or choices."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from gsopt.check import MAX_THREADS, Within
 
@@ -15,3 +15,4 @@ Count = Annotated[int, Within(0)]
 Threads = Annotated[int, Within(0, MAX_THREADS)]
 PositiveCount = Annotated[int, Within(1)]
 ShDegree = Annotated[int, Within(0, 3)]
+Features = Literal["sift", "xfeat", "both"]

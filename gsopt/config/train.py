@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from gsopt import check
 from gsopt.check import Within
-from gsopt.config.bounds import MAX_WEIGHT, Count, Decay, PositiveCount, ShDegree, Threads, Weight
+from gsopt.config.bounds import MAX_WEIGHT, Count, Decay, Features, PositiveCount, ShDegree, Threads, Weight
 from gsopt.config.cells import CellConfig, check_cells
 from gsopt.config.from_json import build
 from gsopt.config.guidance import GuidanceConfig
@@ -60,6 +60,8 @@ class DataConfig:
     """
     mask_model: str | None = None
     """ONNX file of the mask model for auto; by default $GSOPT_MASK_MODEL, else one that rembg has fetched."""
+    features: Features = "sift"
+    """Features that poses are found from where photos come without: sift, xfeat (learned) or both (see gsopt sfm)."""
 
     def __post_init__(self) -> None:
         check.fields(self, "data")

@@ -153,12 +153,20 @@ def _require_prior(config: GuidanceConfig) -> None:
 
 
 def _with_poses(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
-    """Photos or a video without poses become a posed scene beside the run; anything else is left as it is."""
-    data = Path(config.data.path)
+    """Photos or a video without poses become a posed scene beside the run; anything else is left as it is.
+
+    A folder of masks becomes the alpha of that scene: its photos have another lens than the one it was made for.
+    """
+    data, features = Path(config.data.path), config.data.features
     if not needs_poses(data):
+        if features != "sift":
+            log(f"{data} has poses: `--features {features}` changes nothing")
         return config
-    scene = posed_scene(data, run.absolute().parent, SfmConfig(seed=config.seed, threads=config.threads), log)
-    return replace(config, data=replace(config.data, path=str(scene)))
+    masks = "auto" if config.data.masks == "given" else config.data.masks
+    sfm = SfmConfig(features=features, masks=masks, seed=config.seed, threads=config.threads)
+    scene = posed_scene(data, run.absolute().parent, sfm, log)
+    left = config.data.masks if masks in ("auto", "none") else "given"
+    return replace(config, data=replace(config.data, path=str(scene), masks=left))
 
 
 def _with_masks(config: TrainConfig, run: Path, log: Report) -> TrainConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,10 +35,16 @@ def shortened(flags: Flags) -> list[str]:
 
 
 def test_flags_reach_the_training(tmp_path: Path) -> None:
-    flags = Flags(tmp_path / "photos", masks="none", mask_model=Path("a.onnx"), preset="draft", eval=True, threads=2)
-    words = train_arguments(flags)
+    flags = Flags(tmp_path / "photos", masks="none", features="both", preset="draft", eval=True, threads=2)
+    words = train_arguments(replace(flags, mask_model=Path("a.onnx")))
     assert words[:3] == [str(tmp_path / "photos"), "-m", str(Path("runs") / "photos")]
     assert "--resume" not in words
-    for pair in (["--masks", "none"], ["--mask-model", "a.onnx"], ["--preset", "draft"], ["--threads", "2"]):
+    for pair in (
+        ["--masks", "none"],
+        ["--features", "both"],
+        ["--mask-model", "a.onnx"],
+        ["--preset", "draft"],
+        ["--threads", "2"],
+    ):
         assert words[words.index(pair[0]) + 1] == pair[1]
     assert "--eval" in words

@@ -56,6 +56,39 @@ def test_python_and_the_command_line_write_the_same_run(data: Path, tmp_path: Pa
     assert any("evaluating" in line for line in lines)
 
 
+@pytest.mark.parametrize(
+    ("masks", "sought", "left"),
+    [("given", "auto", "given"), ("none", "none", "none"), ("DIR", "DIR", "given")],
+)
+def test_features_and_masks_reach_the_search_for_poses(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, masks: str, sought: str, left: str
+) -> None:
+    photos, folder = tmp_path / "photos", tmp_path / "silhouettes"
+    photos.mkdir()
+    folder.mkdir()
+    Image.new("RGB", (200, 200)).save(photos / "one.jpg")
+    asked: list[Any] = []
+
+    def scene_beside(source: Path, _folder: Path, config: Any, _log: Any) -> Path:
+        asked.append((source, config))
+        return data
+
+    monkeypatch.setattr("gsopt.training.reconstruct.posed_scene", scene_beside)
+    flags = ["--masks", masks.replace("DIR", str(folder)), "--features", "both", "--seed", "3"]
+    assert cli.main(["train", str(photos), "-m", str(tmp_path / "run"), *FLAGS.split(), *flags]) == 0
+    ((source, config),) = asked
+    assert (source, config.masks) == (photos, sought.replace("DIR", str(folder)))
+    assert (config.features, config.seed) == ("both", 3)
+    recorded = TrainConfig.read(tmp_path / "run" / "config.json").data
+    assert (recorded.path, recorded.masks) == (str(data), left)
+
+
+def test_features_for_a_dataset_with_poses_are_said_to_change_nothing(data: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    gsopt.reconstruct(DataConfig(str(data), views=2, features="xfeat"), tmp_path / "run", log=lines.append, **SHORT)
+    assert f"{data} has poses: `--features xfeat` changes nothing" in lines
+
+
 def test_a_missing_mask_model_is_told_before_poses_are_sought(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("U2NET_HOME", str(tmp_path))
     monkeypatch.delenv("GSOPT_MASK_MODEL", raising=False)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsopt.data.image_files import IMAGE_FORMATS
 from gsopt.data.images import read_gray
-from gsopt.data.masks import find_mask
+from gsopt.data.masks import FOLDER, find_mask
 from gsopt.data.sfm.photos import Photo
 from gsopt.errors import InputError
 
@@ -34,9 +34,9 @@ class FeatureInput:
 
 def prepare_masks(choice: str, source: Path, photos: list[Photo], work: Path) -> FeatureInput:
     """Write the masks and opaque copies that `--masks` selects into `work`. InputError where none fits."""
-    folder = source / "masks" if choice == "auto" else Path(choice).expanduser()
+    folder = mask_folder(choice, source)
     has_alpha = any(photo.has_alpha for photo in photos)
-    if choice not in ("alpha", "none") and folder.is_dir():
+    if folder is not None:
         kind, unmasked = "folder", _from_folder(folder, photos, work / "masks")
     elif choice == "alpha" or (choice == "auto" and has_alpha):
         kind, unmasked = "alpha", _from_alpha(photos, work / "masks")
@@ -46,6 +46,12 @@ def prepare_masks(choice: str, source: Path, photos: list[Photo], work: Path) ->
         raise InputError(f"`--masks` names no folder: got {choice}. Give a folder of masks, alpha or none.")
     opaque = _opaque(photos, work / "opaque") if has_alpha else work / "photos"
     return FeatureInput(opaque, None if kind == "none" else work / "masks", kind, unmasked)
+
+
+def mask_folder(choice: str, source: Path) -> Path | None:
+    """The folder of masks that `--masks` selects, if it is there."""
+    folder = source / FOLDER if choice == "auto" else Path(choice).expanduser()
+    return folder if choice not in ("alpha", "none") and folder.is_dir() else None
 
 
 def _from_folder(folder: Path, photos: list[Photo], target: Path) -> list[str]:

@@ -29,7 +29,7 @@ from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, match_joined
 from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
-from gsopt.data.sfm.masks import FeatureInput, prepare_masks
+from gsopt.data.sfm.masks import FeatureInput, mask_folder, prepare_masks
 from gsopt.data.sfm.overview_image import draw_scene
 from gsopt.data.sfm.photos import Photo, RejectedFile, find_photos, natural, read_photos
 from gsopt.data.sfm.placement import Similarity, place
@@ -243,6 +243,7 @@ class _Run:
             "pycolmap": self.pycolmap.__version__,
             "source": str(self.source),
             "fingerprint": fingerprint(self.source),
+            "mask_fingerprint": mask_fingerprint(self.config.masks, self.source),
             "settings": asdict(self.config),
             "matching": matching,
             "masks": inputs.kind,
@@ -283,5 +284,14 @@ def points(reconstruction: Any) -> tuple[Float[np.ndarray, "P 3"], Any]:
 
 def fingerprint(source: Path) -> list[list[Any]]:
     """Name, size and time of each input file: a scene with another fingerprint is out of date."""
-    paths = [source] if is_video(source) else find_photos(source)
+    return _stamps([source] if is_video(source) else find_photos(source))
+
+
+def mask_fingerprint(choice: str, source: Path) -> list[list[Any]]:
+    """The same of the folder that `--masks` selects; empty where it selects none."""
+    folder = mask_folder(choice, source)
+    return [] if folder is None else _stamps(sorted(path for path in folder.iterdir() if path.is_file()))
+
+
+def _stamps(paths: list[Path]) -> list[list[Any]]:
     return [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in paths]

@@ -45,14 +45,18 @@ def posed_scene(data: Path, folder: Path, config: SfmConfig, report: Report) -> 
 
 
 def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
-    """True when the scene was made from these very files, with the same seed."""
-    from gsopt.data.sfm.pipeline import RECORD, fingerprint
+    """True when the scene was made from these very files and masks, with the same features and seed."""
+    from gsopt.data.sfm.pipeline import RECORD, fingerprint, mask_fingerprint
 
     record = scene / RECORD
     if not files.is_regular(record) or not is_posed(scene):
         return False
     try:
         found = files.read_json(record)
-        return found["fingerprint"] == fingerprint(data) and found["settings"]["seed"] == config.seed
+        settings = found["settings"]
+        chosen = (settings.get("features", "sift"), settings["masks"], settings["seed"])
+        if chosen != (config.features, config.masks, config.seed) or found["fingerprint"] != fingerprint(data):
+            return False
+        return bool(found.get("mask_fingerprint", []) == mask_fingerprint(config.masks, data))
     except (InputError, KeyError, TypeError, json.JSONDecodeError):
         return False

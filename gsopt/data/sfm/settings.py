@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gsopt import check
+from gsopt.config.bounds import Features
 from gsopt.errors import UsageError
 
 Mapper = Literal["auto", "incremental", "global", "hybrid"]
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 CameraModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Poses = Literal["find", "prior"]
-Features = Literal["sift", "xfeat", "both"]
 
 MAX_SIDE = 20_000
 MAX_FEATURES = 65_536

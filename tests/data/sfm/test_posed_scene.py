@@ -18,7 +18,7 @@ from gsopt.data.colmap import read_colmap
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import load_scene
 from gsopt.data.sfm.pipeline import PosedScene, pose_photos
-from gsopt.data.sfm.reuse import needs_poses, posed_scene
+from gsopt.data.sfm.reuse import made_from, needs_poses, posed_scene
 from gsopt.data.sfm.trajectory import compare
 from gsopt.data.transforms import read_transforms
 from gsopt.errors import InputError, UsageError
@@ -176,6 +176,20 @@ def test_poses_are_looked_for_only_where_there_are_none(
     shutil.copytree(posed_room.path, tmp_path / "room-posed")
     assert posed_scene(room_photos, tmp_path, QUICK, said.append) == tmp_path / "room-posed"
     assert said == [f"poses found earlier: {tmp_path / 'room-posed'}"]
+
+
+def test_a_scene_of_other_features_or_masks_is_not_taken_again(room_photos: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for photo in room_photos.iterdir():
+        Image.new("L", (room.WIDTH, room.HEIGHT), 255).save(masks / f"{photo.name}.png")
+    chosen = replace(QUICK, masks=str(masks))
+    scene = pose_photos(room_photos, tmp_path / "scene", chosen).path
+    assert made_from(scene, room_photos, chosen)
+    for other in (replace(chosen, features="both"), replace(chosen, masks="auto"), replace(chosen, seed=1)):
+        assert not made_from(scene, room_photos, other)
+    next(masks.iterdir()).unlink()
+    assert not made_from(scene, room_photos, chosen)
 
 
 def test_the_command_reports_and_answers_with_exit_codes(tmp_path: Path, capsys) -> None:
