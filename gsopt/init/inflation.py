@@ -23,7 +23,8 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus, world_up
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
-from gsopt.init.rounded_hull import RADIUS_RATIO, squared_distance
+from gsopt.init.distances import squared_distance
+from gsopt.init.rounded_hull import RADIUS_RATIO
 from gsopt.init.thumbnails import Thumbnail, sample
 
 STEEP = math.radians(50)

@@ -18,18 +18,17 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int16
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt.geometry.projection import inside, project
+from gsopt.init.distances import squared_distance
 from gsopt.init.thumbnails import Thumbnail
 
 ROUNDS = 2
 """The remains are measured again: without the tips their stumps are thin."""
 RADIUS_RATIO = 1.1
 """Ratio of two successive radii."""
-FAR_SQUARED = 1 << 13
-"""Squared distance beyond everything, cells; twice that still fits 16 bits."""
 
 
 def rounded(
@@ -78,27 +77,3 @@ def thickness(cells: Bool[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"]:
         radius = largest / RADIUS_RATIO**level
         thick[squared_distance(depth >= radius**2, math.ceil(radius)) <= radius**2] = radius
     return (thick * solid)[1:-1, 1:-1, 1:-1]
-
-
-def squared_distance(cells: Bool[Tensor, "X Y Z"], reach: int) -> Int16[Tensor, "X Y Z"]:
-    """Squared distance to the nearest true cell, exact within `reach` cells along each axis, FAR_SQUARED beyond: one
-    axis after the other (Felzenszwalb & Huttenlocher 2012), the first of them, the last in memory, by a scan."""
-    found = _squared_along_rows(cells, min(reach, math.isqrt(FAR_SQUARED)))
-    for axis in range(2):
-        size, nearest = found.shape[axis], found.clone()
-        for offset in range(1, min(reach, size - 1, math.isqrt(FAR_SQUARED)) + 1):
-            for behind, ahead in ((0, offset), (offset, 0)):
-                there = nearest.narrow(axis, ahead, size - offset)
-                torch.minimum(there, found.narrow(axis, behind, size - offset) + offset**2, out=there)
-        found = nearest.clamp_(max=FAR_SQUARED)
-    return found
-
-
-def _squared_along_rows(cells: Bool[Tensor, "X Y Z"], reach: int) -> Int16[Tensor, "X Y Z"]:
-    """Squared distance to the nearest true cell of the same row; FAR_SQUARED for more than `reach` cells."""
-    size = cells.shape[2]
-    place = torch.arange(size, dtype=torch.int32)
-    before = torch.where(cells, place, -size - reach).cummax(2).values
-    after = torch.where(cells, place, 2 * size + reach).flip(2).cummin(2).values.flip(2)
-    distance = torch.minimum(place - before, after - place)
-    return torch.where(distance <= reach, distance.square(), FAR_SQUARED).to(torch.int16)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gsopt.geometry.projection import project
-from gsopt.init.rounded_hull import squared_distance
+from gsopt.init.distances import squared_distance
 from gsopt.init.thumbnails import Thumbnail, sample
 from gsopt.symmetry.axis import Axis
 from gsopt.symmetry.mirror import Mirror

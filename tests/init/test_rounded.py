@@ -13,7 +13,7 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus
 from gsopt.geometry.voxels import Grid
 from gsopt.init.hull import carve
-from gsopt.init.rounded_hull import FAR_SQUARED, RADIUS_RATIO, rounded, squared_distance, thickest, thickness
+from gsopt.init.rounded_hull import RADIUS_RATIO, rounded, thickest, thickness
 from gsopt.init.thumbnails import Thumbnail, small_photos
 
 pytestmark = pytest.mark.usefixtures("coarse_hull")
@@ -35,18 +35,6 @@ def in_ellipsoid(grid: Grid, radii: tuple[float, float, float]) -> torch.Tensor:
     centers = grid.centers(torch.ones_like(grid.occupied))
     inside = ((centers - torch.tensor(CENTER)) / torch.tensor(radii)).norm(dim=1) <= 1
     return inside.view(grid.occupied.shape)
-
-
-def test_the_distance_is_that_of_all_pairs() -> None:
-    cells = torch.rand(9, 7, 11, generator=torch.Generator().manual_seed(0)) < 0.02
-    everywhere = torch.nonzero(torch.ones_like(cells)).double()
-    exact = torch.cdist(everywhere, torch.nonzero(cells).double()).amin(1).square().round()
-    assert torch.equal(squared_distance(cells, 11).flatten().double(), exact)
-    near = squared_distance(cells, 2).flatten().double()
-    within = exact <= 4
-    assert torch.equal(near[within], exact[within])
-    assert bool((near >= exact).all())
-    assert bool((squared_distance(torch.zeros_like(cells), 3) == FAR_SQUARED).all())
 
 
 def test_the_thickness_of_a_ball_a_slab_and_a_rod() -> None:

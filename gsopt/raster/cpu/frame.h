@@ -160,6 +160,16 @@ struct MatchArguments {
   float* costs;  // [padded]
 };
 
+// Squared distances in a grid, the last axis contiguous (cpu/distance.h).
+constexpr int16_t kFarSquared = 1 << 13;  // beyond everything; with the square of a reach it still fits 16 bits
+struct DistanceArguments {
+  const uint8_t* cells;
+  int shape[3];
+  int reach;  // cells, its square no more than kFarSquared
+  int16_t* squared;
+  Buffer* slab;
+};
+
 // What one core can do at best, lanes per second: fused multiply-adds, and exponentials.
 struct Calibration {
   double fma, exp;
@@ -176,6 +186,7 @@ struct Kernels {
   void (*photometric)(Pool&, PhotometricArguments&);
   void (*adam)(Pool&, const AdamArguments&);
   void (*match)(Pool&, const MatchArguments&);
+  void (*distance)(const DistanceArguments&);
   Calibration (*calibrate)();
 };
 

@@ -8,6 +8,7 @@
 #include "blend.h"
 #include "blend_backward.h"
 #include "calibrate.h"
+#include "distance.h"
 #include "match.h"
 #include "photometric.h"
 #include "project_backward.h"
@@ -28,6 +29,7 @@ const Kernels kernels = {
     photometric_stage,
     adam_stage,
     match_stage,
+    distance_stage,
     calibrate,
 };
 

@@ -43,6 +43,8 @@ namespace {
 
 using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using InByte = nb::ndarray<const uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using OutShort = nb::ndarray<int16_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 
 // Those this processor can run, best first.
@@ -293,6 +295,14 @@ void match(Workspace& ws, const Windows& w, In corners, int height, int width, c
   timed(ws, "match", [&] { ws.kernels->match(ws.pool, a); });
 }
 
+void squared_distance(Workspace& ws, InByte cells, int reach, OutShort squared) {
+  DistanceArguments a = {cells.data(), {}, reach, data_of(squared, cells.size(), "squared"), &ws.scratch};
+  for (int axis = 0; axis < 3; ++axis) a.shape[axis] = static_cast<int>(cells.shape(axis));
+  if (reach < 0 || reach * reach > kFarSquared) throw std::invalid_argument("squared_distance: reach out of range");
+  nb::gil_scoped_release release;
+  timed(ws, "distance", [&] { ws.kernels->distance(a); });
+}
+
 }  // namespace
 
 NB_MODULE(_cpu, m) {
@@ -352,6 +362,7 @@ NB_MODULE(_cpu, m) {
       nb::arg("step"), nb::arg("camera"), nb::arg("sh_degree"));
   nb::class_<Windows>(m, "Windows").def(nb::init<In, In, In, In, float, float, float, float>());
   m.def("match", &match);
+  m.def("squared_distance", &squared_distance, nb::arg(), nb::arg(), nb::arg(), out);
 }
 
 }  // namespace gsopt
