@@ -11,9 +11,6 @@ pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
 import textured_room as room
 
 from gsopt.data.sfm.pipeline import PosedScene, pose_photos
-from gsopt.data.sfm.settings import SfmConfig
-
-QUICK = SfmConfig(max_features=1200, threads=1)
 
 
 @pytest.fixture(scope="session")
@@ -25,4 +22,4 @@ def room_photos(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def posed_room(room_photos: Path, tmp_path_factory) -> PosedScene:
-    return pose_photos(room_photos, tmp_path_factory.mktemp("scene") / "room", QUICK)
+    return pose_photos(room_photos, tmp_path_factory.mktemp("scene") / "room", room.QUICK)

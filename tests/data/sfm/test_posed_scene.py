@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import textured_room as room
-from conftest import QUICK
 from PIL import Image
 
 from gsopt import cli
@@ -74,13 +73,13 @@ def test_points_have_the_colors_that_the_photos_show(posed_room: PosedScene) -> 
 def test_the_same_photos_give_the_same_bits_for_any_number_of_threads(
     posed_room: PosedScene, room_photos: Path, tmp_path: Path
 ) -> None:
-    again = pose_photos(room_photos, tmp_path / "again", replace(QUICK, threads=2))
+    again = pose_photos(room_photos, tmp_path / "again", replace(room.QUICK, threads=2))
     assert contents(again.path) == contents(posed_room.path)
 
 
 @pytest.mark.parametrize("mapper", ["global", "hybrid"])
 def test_the_other_mappers_find_the_same_poses(room_photos: Path, tmp_path: Path, mapper: str) -> None:
-    posed = pose_photos(room_photos, tmp_path / "scene", replace(QUICK, mapper=mapper))
+    posed = pose_photos(room_photos, tmp_path / "scene", replace(room.QUICK, mapper=mapper))
     assert posed.diagnosis.mapper == mapper
     error = compare(viewmats(read_colmap(posed.path).frames), room.arc(6).numpy())
     assert error.rotation_degrees.max() < ROTATION
@@ -88,7 +87,7 @@ def test_the_other_mappers_find_the_same_poses(room_photos: Path, tmp_path: Path
 
 def test_global_mapping_finds_the_lens_where_exif_tells_none(tmp_path: Path) -> None:
     room.photograph(tmp_path / "photos", room.arc(8), exif=False)
-    posed = pose_photos(tmp_path / "photos", tmp_path / "scene", replace(QUICK, mapper="global"))
+    posed = pose_photos(tmp_path / "photos", tmp_path / "scene", replace(room.QUICK, mapper="global"))
     assert len(posed.diagnosis.registered) == 8
     frames = read_colmap(posed.path).frames
     assert compare(viewmats(frames), room.arc(8).numpy()).rotation_degrees.max() < 2 * ROTATION
@@ -107,7 +106,7 @@ def test_photos_stored_sideways_and_in_other_sizes_find_their_place(tmp_path: Pa
     with Image.open(photos / names[4]) as image:
         smaller = image.resize((320, 240), Image.Resampling.BOX)
     smaller.save(photos / names[4], quality=95, exif=room.focal_exif())
-    posed = pose_photos(photos, tmp_path / "scene", QUICK)
+    posed = pose_photos(photos, tmp_path / "scene", room.QUICK)
     assert len(posed.diagnosis.registered) == 6
     source = read_colmap(posed.path)
     assert compare(viewmats(source.frames), room.arc(6).numpy()).rotation_degrees.max() < ROTATION
@@ -120,7 +119,7 @@ def test_known_poses_are_kept_and_get_points(posed_room: PosedScene, tmp_path: P
     for path in (posed_room.path / "images").iterdir():
         shutil.copy(path, known / "images")
     shutil.copy(posed_room.path / "transforms.json", known)
-    posed = pose_photos(known, tmp_path / "scene", replace(QUICK, poses="prior"))
+    posed = pose_photos(known, tmp_path / "scene", replace(room.QUICK, poses="prior"))
     before, after = read_transforms(known), read_colmap(posed.path)
     np.testing.assert_allclose(viewmats(after.frames), viewmats(before.frames), atol=1e-9)
     np.testing.assert_allclose(after.frames[0].K, before.frames[0].K)
@@ -134,7 +133,7 @@ def test_masks_become_alpha_and_keep_features_out(room_photos: Path, tmp_path: P
     left.paste(255, (0, 0, 260, room.HEIGHT))
     for photo in room_photos.iterdir():
         left.save(masks / f"{photo.name}.png")
-    posed = pose_photos(room_photos, tmp_path / "scene", replace(QUICK, masks=str(masks)))
+    posed = pose_photos(room_photos, tmp_path / "scene", replace(room.QUICK, masks=str(masks)))
     view = load_scene(posed.path).train[0]
     pixels = view.pixels()
     assert pixels.shape[2] == 4
@@ -146,7 +145,7 @@ def test_two_rooms_in_one_folder_are_told_apart(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     room.photograph(photos, room.arc(5))
     others = room.photograph(photos, room.arc(4), seed=7, first=5)
-    report = pose_photos(photos, tmp_path / "scene", QUICK).diagnosis
+    report = pose_photos(photos, tmp_path / "scene", room.QUICK).diagnosis
     assert len(report.registered) == 5
     assert {left.name: left.kind for left in report.left} == dict.fromkeys(others, "apart")
     assert any("4 photos match only each other" in text for text in report.advice)
@@ -155,14 +154,14 @@ def test_two_rooms_in_one_folder_are_told_apart(tmp_path: Path) -> None:
 def test_too_few_photos_leave_nothing_behind(tmp_path: Path) -> None:
     room.photograph(tmp_path / "photos", room.arc(8)[[0, 1]])
     with pytest.raises(InputError, match=r"fewer than 3 of 2(.|\n)*Two photos: they have \d+ features in common"):
-        pose_photos(tmp_path / "photos", tmp_path / "scene", QUICK)
+        pose_photos(tmp_path / "photos", tmp_path / "scene", room.QUICK)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
 def test_an_output_that_exists_is_left_alone(posed_room: PosedScene, room_photos: Path) -> None:
     before = contents(posed_room.path)
     with pytest.raises(UsageError, match="must not exist yet"):
-        pose_photos(room_photos, posed_room.path, QUICK)
+        pose_photos(room_photos, posed_room.path, room.QUICK)
     assert contents(posed_room.path) == before
 
 
@@ -174,7 +173,7 @@ def test_poses_are_looked_for_only_where_there_are_none(
     assert not needs_poses(tmp_path)
     said: list[str] = []
     shutil.copytree(posed_room.path, tmp_path / "room-posed")
-    assert posed_scene(room_photos, tmp_path, QUICK, said.append) == tmp_path / "room-posed"
+    assert posed_scene(room_photos, tmp_path, room.QUICK, said.append) == tmp_path / "room-posed"
     assert said == [f"poses found earlier: {tmp_path / 'room-posed'}"]
 
 
