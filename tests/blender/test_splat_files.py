@@ -63,6 +63,18 @@ def test_columns_in_any_order_and_type_are_found(tmp_path: Path, some_splats: Sp
     assert_alike(read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "a.ply"), 0)
 
 
+def test_numbers_of_single_and_double_precision_stand_side_by_side(tmp_path: Path, some_splats: Splats) -> None:
+    write_ply(tmp_path / "a.ply", some_splats)
+    head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property")]
+    rows = np.frombuffer(data, np.dtype([(name, "<f4") for name in names]))
+    other = rows.astype(np.dtype([(name, "<f4" if name in "xyz" else "<f8") for name in names]))
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {'float' if name in 'xyz' else 'double'} {name}" for name in names]
+    (tmp_path / "b.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + other.tobytes())
+    assert_alike(read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "a.ply"), 0)
+
+
 def ply_with(tmp_path: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
     write_ply(tmp_path / "good.ply", random_splats(20, 0))
     data = (tmp_path / "good.ply").read_bytes()

@@ -189,6 +189,20 @@ def test_a_broken_pose_names_its_image(tmp_path: Path, quat: str, message: str) 
     assert "im 002.png" in str(caught.value) or "line 2" in message
 
 
+def test_a_quaternion_of_any_length_is_the_same_rotation(tmp_path: Path) -> None:
+    before = load_scene(colmap(tmp_path / "a", 3, ".txt"))
+    path = colmap(tmp_path / "b", 3, ".txt") / "sparse" / "0" / "images.txt"
+    lines = path.read_text().splitlines()
+    for row, line in enumerate(lines):
+        words = line.split()
+        if words and words[-1].endswith(".png"):
+            lines[row] = " ".join([words[0], *(str(3 * float(word)) for word in words[1:5]), *words[5:]])
+    path.write_text("\n".join([*lines, ""]))
+    after = load_scene(tmp_path / "b")
+    for one, other in zip(before.train, after.train, strict=True):
+        torch.testing.assert_close(one.camera.viewmats, other.camera.viewmats)
+
+
 def test_declared_and_actual_size_are_both_named(tmp_path: Path) -> None:
     colmap(tmp_path)
     Image.new("RGB", (12, 16)).save(tmp_path / "images" / "im 006.png")

@@ -66,6 +66,13 @@ def test_llff_cameras_are_those_that_were_written(tmp_path: Path) -> None:
     assert scene.train[0].camera.Ks[0].tolist() == [[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]]
 
 
+def test_only_files_that_are_images_are_paired_by_position(tmp_path: Path) -> None:
+    root = llff(tmp_path)
+    (root / "images" / "a folder.png").mkdir()
+    (root / "images" / "notes.txt").write_text("taken in May")
+    assert [view.name for view in load_scene(root).train] == [f"images/im_{i}.png" for i in range(COUNT)]
+
+
 def test_llff_focal_lengths_follow_the_size_of_the_stored_images(tmp_path: Path) -> None:
     scene = load_scene(llff(tmp_path, llff_rows(ring(COUNT), size=5 * SIZE, focal=5 * FOCAL)))
     assert scene.train[0].camera.Ks[0, 0, 0] == FOCAL

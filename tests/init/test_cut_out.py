@@ -155,6 +155,8 @@ def test_boxes_have_a_margin_and_stay_in_the_image() -> None:
     assert box_around(torch.zeros(5, 5, dtype=torch.bool), 10, 10) is None
     assert overlap((0, 0, 2, 2), (1, 1, 3, 3)) == pytest.approx(1 / 7)
     assert overlap((0, 0, 2, 2), (2, 2, 3, 3)) == 0
+    assert overlap((0, 5, 4, 8), (1, 5, 7, 7)) == pytest.approx(1 / 3)
+    assert overlap((0, 0, 2, 9), (5, 0, 7, 9)) == 0 == overlap((0, 0, 9, 2), (0, 5, 9, 7))
 
 
 def test_without_a_model_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = {
     "gsopt/data/sfm": "tests/data/sfm",
     "gsopt/data": "tests/data",
+    "gsopt/formats/mesh_files.py": "tests/results/mesh",
     "gsopt/formats": "tests/formats",
     "gsopt/training": "tests/training",
     "gsopt/sds": "tests/sds",

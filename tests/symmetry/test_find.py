@@ -11,7 +11,7 @@ import torch
 from balls import Ball, mirrored, ring, write_balls
 from PIL import Image
 
-from gsopt.data.scene import Scene, load_scene
+from gsopt.data.scene import Scene, View, load_scene
 from gsopt.geometry.voxels import Grid
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.symmetry.colors import MIN_PAIRS, disagreement
@@ -46,6 +46,21 @@ def test_the_mirror_of_a_symmetric_thing_is_found(mirror: Mirror, tmp_path: Path
     assert abs(float(found[0].element.distance(middle))) < 0.02
     assert found[0].misses <= MAX_MISSES / 4
     assert found[0].colored
+
+
+def test_a_miss_is_a_share_of_the_object_wherever_the_world_begins(tmp_path: Path) -> None:
+    mirror = slanted()
+    scene = scene_of(tmp_path / "thing", mirrored(HALF, mirror))
+    step = torch.tensor([3.0, -5.0, 4.0])
+
+    def moved(view: View) -> View:
+        viewmats = view.camera.viewmats.clone()
+        viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ step
+        return replace(view, camera=replace(view.camera, viewmats=viewmats))
+
+    here, there = find_symmetries(scene), find_symmetries(replace(scene, train=tuple(map(moved, scene.train))))
+    assert len(here) == len(there) == 1
+    assert there[0].misses == pytest.approx(here[0].misses, rel=0.1)
 
 
 def test_a_lopsided_thing_has_none(tmp_path: Path) -> None:

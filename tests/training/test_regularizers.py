@@ -76,6 +76,13 @@ def test_alpha_term() -> None:
     torch.testing.assert_close(alpha_gradient(alphas, target, 0.3), expected, rtol=1e-12, atol=0)
 
 
+def test_terms_of_a_single_gaussian() -> None:
+    opacity, scale = torch.zeros(1), torch.zeros(1, 3)
+    add_opacity_gradient(opacity, torch.zeros(1), 1.0)
+    add_scale_gradient(scale, torch.zeros(1, 3), 1.0)
+    assert (opacity.tolist(), scale.tolist()) == ([0.25], [[pytest.approx(1 / 3)] * 3])
+
+
 def test_terms_of_an_empty_scene_are_empty() -> None:
     opacities, scales = torch.empty(0), torch.empty(0, 3)
     add_opacity_gradient(opacities, torch.empty(0), 1.0)

@@ -211,6 +211,10 @@ def test_logarithmic_ticks_start_below_and_rise(low: float, high: float) -> None
     assert all(b > a for a, b in itertools.pairwise(marks))
 
 
+def test_logarithmic_ticks_of_three_decades_are_all_there() -> None:
+    assert charts.log_ticks(5, 1000) == [5, 10, 20, 50, 100, 200, 500, 1000]
+
+
 def test_a_chart_stays_inside_its_frame_and_keeps_the_last_value() -> None:
     points = [(float(step), 1 / (step + 1)) for step in range(5000)]
     svg = charts.line_chart("Loss", points, log=True)
