@@ -152,6 +152,7 @@ def test_boxes_have_a_margin_and_stay_in_the_image() -> None:
     left, top, right, bottom = box_around(solid, 1000, 500) or (0, 0, 0, 0)
     assert (left, top) == (0, 52)
     assert (right, bottom) == (448, 348)
+    assert box_around(solid.T, 500, 1000) == (52, 0, 348, 448)
     assert box_around(torch.zeros(5, 5, dtype=torch.bool), 10, 10) is None
     assert overlap((0, 0, 2, 2), (1, 1, 3, 3)) == pytest.approx(1 / 7)
     assert overlap((0, 0, 2, 2), (2, 2, 3, 3)) == 0
