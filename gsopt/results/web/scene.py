@@ -26,6 +26,8 @@ CAMERA_SIZE = 0.06
 DEFAULT_SIZE = 800
 FILLED, MAX_ZOOM, OUTSIDE = 0.92, 3.0, 0.002
 """Share of the opening image that the splats fill; most it is magnified; share of splats left out on each side."""
+SOLID = 0.1
+"""Opacity above which a splat counts there: 132 of the demo's 19,368 have more than one half, none at its feet."""
 DIGITS = 7
 """Significant digits of a number in the page: float32 has as many."""
 
@@ -116,7 +118,7 @@ def scene_of_views(run: FinishedRun, scene: Scene) -> WebScene:
 
 def framed(gaussians: Gaussians, camera: Cameras) -> Cameras:
     """The camera with another lens, so that the solid splats in its image fill it; never wider than before."""
-    means = gaussians.means[gaussians.opacities > 0.5].double()
+    means = gaussians.means[gaussians.opacities > SOLID].double()
     t = means @ camera.viewmats[0, :3, :3].double().T + camera.viewmats[0, :3, 3].double()
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     pixels = t @ camera.Ks[0].double().T

@@ -58,7 +58,7 @@ class Renderer {
     this.canvas = canvas;
     this.scene = scene;
     const gl = this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
-    if (!gl) throw new Error("This browser has no WebGL 2.");
+    if (!gl) throw new Error("This browser has no WebGL 2. Turn on its hardware acceleration, or take another one.");
     this.half = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.splats = this.program(SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.screen = this.program(SCREEN_VERTEX, SCREEN_FRAGMENT);

@@ -8,6 +8,7 @@ import json
 import re
 import sys
 import zlib
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,9 @@ def test_the_opening_view_is_filled(run: Path) -> None:
     pixel = (zoomed.Ks[0] @ torch.tensor([0.3, -0.3, 1.0]))[:2]
     assert float(zoomed.Ks[0, 0, 0]) > 200
     torch.testing.assert_close(pixel, torch.tensor([50.0, 50]), atol=8, rtol=0)
+    faint = replace(blob, logit_opacities=torch.full((200,), -1.0))
+    faint.logit_opacities[:10] = 1.0  # these alone would be magnified more
+    assert torch.equal(framed(faint, camera).Ks, framed(replace(blob, logit_opacities=torch.ones(200)), camera).Ks)
     wall = splats(2000)
     wall.means[:] = torch.rand(2000, 3, generator=torch.manual_seed(0)) * 2 - 1 + torch.tensor([0.0, 0, 1])
     wall.means[:, 2] = 1
