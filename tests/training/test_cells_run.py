@@ -23,6 +23,7 @@ from gsopt.events import read_events
 from gsopt.farm.job import Job, Outcome
 from gsopt.formats import load_splats
 from gsopt.training.cells import run as cells_run
+from gsopt.training.cells import stages
 from gsopt.training.cells.plan import read_plan
 from gsopt.training.cells.size import cell_sizes
 from gsopt.training.cells.worker import handle
@@ -132,6 +133,26 @@ def test_a_killed_driver_goes_on_to_the_same_bits(whole: Path, data: Path, tmp_p
     assert code == 0
     assert splats(run) == splats(whole)
     assert (run / "coarse" / "splat.ply").stat().st_mtime_ns == kept
+
+
+def test_a_stop_reaches_the_stage_that_is_under_way(
+    data: Path, tmp_path: Path, here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stages, "POLL_SECONDS", 0.01)
+    run, reached = tmp_path / "run", []
+
+    def stop(job: Job) -> None:
+        (run / job.name).mkdir(parents=True)
+        (run / "stop").touch()
+        deadline = time.monotonic() + 30
+        while not (run / job.name / "stop").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        reached.append((run / job.name / "stop").exists())
+        raise InputError("The rest of this run is another test's.")
+
+    here.before = stop  # type: ignore[method-assign]
+    assert cli.main(["train", str(data), "-m", str(run), *FLAGS]) == InputError.exit_code
+    assert reached == [True]
 
 
 @pytest.mark.parametrize("stage", ["cells/01", "polish"])
