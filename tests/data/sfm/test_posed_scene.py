@@ -141,13 +141,14 @@ def test_masks_become_alpha_and_keep_features_out(room_photos: Path, tmp_path: P
     assert int(pixels[:, 290:, 3].max()) == 0
 
 
-def test_two_rooms_in_one_folder_are_told_apart(tmp_path: Path) -> None:
+def test_two_rooms_and_a_broken_file_in_one_folder_are_told_apart(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     room.photograph(photos, room.arc(5))
+    (photos / "broken.jpg").write_bytes(b"not a photo")
     others = room.photograph(photos, room.arc(4), seed=7, first=5)
     report = pose_photos(photos, tmp_path / "scene", room.QUICK).diagnosis
     assert len(report.registered) == 5
-    assert {left.name: left.kind for left in report.left} == dict.fromkeys(others, "apart")
+    assert {left.name: left.kind for left in report.left} == {**dict.fromkeys(others, "apart"), "broken.jpg": "refused"}
     assert any("4 photos match only each other" in text for text in report.advice)
 
 
