@@ -183,7 +183,7 @@ def test_a_scene_of_other_features_or_masks_is_not_taken_again(room_photos: Path
     masks.mkdir()
     for photo in room_photos.iterdir():
         Image.new("L", (room.WIDTH, room.HEIGHT), 255).save(masks / f"{photo.name}.png")
-    chosen = replace(QUICK, masks=str(masks))
+    chosen = replace(room.QUICK, masks=str(masks))
     scene = pose_photos(room_photos, tmp_path / "scene", chosen).path
     assert made_from(scene, room_photos, chosen)
     for other in (replace(chosen, features="both"), replace(chosen, masks="auto"), replace(chosen, seed=1)):
