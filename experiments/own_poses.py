@@ -1,4 +1,4 @@
-"""What few photos are worth with nothing but themselves: poses found from these photos alone, held-out views evaluated.
+"""Trains on few photos with poses found from these photos alone, and evaluates held-out views.
 
     python experiments/own_poses.py DATA OUT --views 8 [--flags="--features both"] [--train="-r 4 --threads 1"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
@@ -49,28 +50,27 @@ def test_opacities_of_0_and_1_stay_finite(odd_folder: Path, some_splats: Splats)
     assert again.scales[0].max() < 1e-37
 
 
-def test_columns_in_any_order_and_type_are_found(tmp_path: Path, some_splats: Splats) -> None:
+@pytest.mark.parametrize(
+    "columns",
+    [
+        lambda names: [("red", ">u1"), *((name, ">f8") for name in reversed(names))],
+        lambda names: [(name, ">f4" if name in "xyz" else ">f8") for name in names],
+    ],
+    ids=["reversed doubles after a byte", "floats before doubles"],
+)
+def test_columns_in_any_order_and_type_are_found(
+    tmp_path: Path, some_splats: Splats, columns: Callable[[list[str]], list[tuple[str, str]]]
+) -> None:
     write_ply(tmp_path / "a.ply", some_splats)
     head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
     names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property")]
     rows = np.frombuffer(data, np.dtype([(name, "<f4") for name in names]))
-    other = np.empty(len(rows), np.dtype([("red", "u1"), *((name, ">f8") for name in reversed(names))]))
+    other = np.empty(len(rows), np.dtype(columns(names)))
     for name in names:
         other[name] = rows[name]
-    lines = ["ply", "format binary_big_endian 1.0", f"element vertex {len(rows)}", "property uchar red"]
-    lines += [f"property double {name}" for name in reversed(names)]
-    (tmp_path / "b.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + other.tobytes())
-    assert_alike(read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "a.ply"), 0)
-
-
-def test_numbers_of_single_and_double_precision_stand_side_by_side(tmp_path: Path, some_splats: Splats) -> None:
-    write_ply(tmp_path / "a.ply", some_splats)
-    head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
-    names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property")]
-    rows = np.frombuffer(data, np.dtype([(name, "<f4") for name in names]))
-    other = rows.astype(np.dtype([(name, "<f4" if name in "xyz" else "<f8") for name in names]))
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [f"property {'float' if name in 'xyz' else 'double'} {name}" for name in names]
+    kinds = {">u1": "uchar", ">f4": "float", ">f8": "double"}
+    lines = ["ply", "format binary_big_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {kinds[kind]} {name}" for name, kind in columns(names)]
     (tmp_path / "b.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + other.tobytes())
     assert_alike(read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "a.ply"), 0)
 
