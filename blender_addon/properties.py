@@ -40,7 +40,7 @@ PRIORS = [
 ]
 PRESETS = [
     ("draft", "Draft", "About 2000 steps with more skips"),
-    ("default", "Default", "7000 steps"),
+    ("default", "Default", "4000 steps"),
     ("high", "High", "15,000 steps"),
     ("own", "Own", "As set below"),
 ]
@@ -119,7 +119,7 @@ class GsoptScene(bpy.types.PropertyGroup):
     )  # type: ignore[valid-type]
 
     preset: EnumProperty(name="Preset", items=PRESETS, default="default")  # type: ignore[valid-type]
-    iterations: IntProperty(name="Steps", default=7000, min=1)  # type: ignore[valid-type]
+    iterations: IntProperty(name="Steps", default=4000, min=1)  # type: ignore[valid-type]
     downscale: IntProperty(name="Divide Size by", default=1, min=1, max=16)  # type: ignore[valid-type]
     budget: IntProperty(name="Most Gaussians", default=0, min=0, description="0: as many as the images call for")  # type: ignore[valid-type]
     views: IntProperty(name="Input Views", default=0, min=0, description="Learn from this many; 0: all")  # type: ignore[valid-type]

@@ -36,6 +36,7 @@ from gsopt.config.guidance import GuidanceConfig  # noqa: E402
 from gsopt.config.train import DataConfig, InitConfig, OptimizerConfig, TrainConfig  # noqa: E402
 from gsopt.data.scene import load_scene  # noqa: E402
 from gsopt.events import to_json, write_atomic  # noqa: E402
+from gsopt.gaussians import PARAMETERS  # noqa: E402
 from gsopt.metrics import capped_psnr  # noqa: E402
 from gsopt.raster.backend import RasterSettings  # noqa: E402
 from gsopt.raster.device.backend import DeviceBackend  # noqa: E402
@@ -44,7 +45,7 @@ from gsopt.results.finished_run import draw, truth  # noqa: E402
 from gsopt.sds.guidance_step import Guidance  # noqa: E402
 from gsopt.training import loop  # noqa: E402
 from gsopt.training.loop import train  # noqa: E402
-from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates  # noqa: E402
+from gsopt.training.optimizer import OptimizedGaussians, adam_step  # noqa: E402
 
 RESULT = ROOT / "experiments" / "results" / "gpu.json"
 COMMAND = "python experiments/gpu.py"
@@ -110,7 +111,7 @@ class Iteration:
         gaussians = replace(gaussians, means=means, log_scales=gaussians.log_scales + torch.tensor(smaller).log())
         self.model = OptimizedGaussians.start(gaussians.to(self.backend.device))
         self.settings, self.config = RasterSettings(), OptimizerConfig()
-        self.rates = {name: 1e-7 * rate for name, rate in learning_rates(self.config, 1e-4).items()}
+        self.rates = dict.fromkeys(PARAMETERS, 1e-10)
         noise = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(1))
         self.target = noise.to(self.backend.device)
         self.gradients: Any = None

@@ -27,7 +27,7 @@ from gsopt.gaussians import PARAMETERS, Gaussians
 from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.raster.cpu_backend import CpuBackend
 from gsopt.training.checkpoint import load_newest
-from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
+from gsopt.training.optimizer import OptimizedGaussians, adam_step
 from gsopt.training.targets import Target, Targets
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -76,7 +76,7 @@ class State:
         frame = self.backend.forward(self.model.gaussians, target.camera, settings, torch.ones(3))
         loss = self.backend.photometric(frame.colors, target.colors, 0.2)
         self.gradients = self.backend.backward(frame, loss.v_colors, bands=False, into=self.gradients)
-        rates = dict.fromkeys(learning_rates(OptimizerConfig(), 0.0), 0.0)
+        rates = dict.fromkeys(PARAMETERS, 0.0)
         adam_step(self.model, self.gradients, rates, OptimizerConfig(), self.backend, target.camera, settings)
         return frame.colors, self.gradients
 

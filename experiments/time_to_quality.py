@@ -75,7 +75,7 @@ def run(scene: Path, views: int | None, seed: int, arm: str, checkout: str, more
         flags += [str(PREVIEWS_ALL if views is None else PREVIEWS)]
         flags += [] if views is None else ["--views", str(views)]
         flags += [*ARMS[arm](views), *more]
-        command = [sys.executable, "-m", "gsopt", "train", str(scene), "-m", f"{folder}/run", *flags]
+        command = [sys.executable, "-P", "-m", "gsopt", "train", str(scene), "-m", f"{folder}/run", *flags]
         path = {"PYTHONPATH": checkout} if checkout else {}
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env={**os.environ, **path})
         finished = open_run(Path(folder, "run"), threads=1)

@@ -14,7 +14,7 @@ class Training:
 
     preset: str = ""
     """draft, default or high; empty: steps and size as given here."""
-    iterations: int = 7000
+    iterations: int = 4000
     downscale: int = 1
     """Width and height are divided by this."""
     max_gaussians: int = 0
@@ -29,7 +29,7 @@ class Training:
     backend: str = "auto"
 
 
-STEPS = {"draft": 2000, "default": 7000, "high": 15_000}
+STEPS = {"draft": 2000, "default": 4000, "high": 15_000}
 """About as many as gsopt's presets take: decides how often a preview comes."""
 
 

@@ -19,10 +19,11 @@ from gsopt.benchmark.stopwatch import Reading, both, repeat
 from gsopt.benchmark.surface_scene import surface_scene
 from gsopt.config.train import OptimizerConfig
 from gsopt.errors import UsageError
+from gsopt.gaussians import PARAMETERS
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.raster.cpu_backend import CpuBackend
-from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
+from gsopt.training.optimizer import OptimizedGaussians, adam_step
 
 CASES = ("200x200/20k", "400x400/50k", "800x800/100k", "800x800/300k")
 CASE_PATTERN = re.compile(r"(\d+)x(\d+)/(\d+)(k|M|)")
@@ -76,7 +77,7 @@ class Iteration:
         self.settings = RasterSettings()
         self.config = OptimizerConfig()
         # Rates so small that the scene does not change between the first and the last repetition.
-        self.rates = {name: 1e-7 * rate for name, rate in learning_rates(self.config, 1e-4).items()}
+        self.rates = dict.fromkeys(PARAMETERS, 1e-10)
         self.target = blurred_noise(self.camera)
         self.gradients: Gradients | None = None
         """Gradients of the last iteration; the next one reuses their memory, as the trainer does."""

@@ -31,7 +31,7 @@ class Flags:
     """Features that poses are found from: sift; xfeat, learned ones (pip install 'gsopt[match]'); or both, for few
     photos of smooth things."""
     preset: Preset = "default"
-    """draft: 2000 steps; default: 7000 steps; high: 15,000 steps; fewer for few photos."""
+    """draft: 2000 steps; default: 4000 steps; high: 15,000 steps; fewer for few photos."""
     eval: bool = False
     """Hold out every 8th photo."""
     threads: int = 0

@@ -25,6 +25,8 @@ MAX_GAUSSIANS = 100_000_000
 """More than any machine this runs on can hold."""
 MAX_COARSE_STEPS = 6
 """Halvings of the resolution at the first step."""
+GONE = {"density": ("grow_scale3d",)}
+"""Settings per section that older versions wrote and this one has not: they are ignored."""
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """Fixed backgrounds, RGB; `random` draws one per step."""
 
@@ -90,20 +92,21 @@ class InitConfig:
 class OptimizerConfig:
     """Adam's learning rates (Kerbl et al. 2023) and its constants."""
 
-    lr_means: Weight = 1.6e-4
-    """Learning rate of the means, times the scene extent; decays log-linearly to `lr_means_final` over the run."""
+    lr_means: Weight | None = None
+    """Learning rate of the means, times the scene extent; decays log-linearly to `lr_means_final` over the run. By
+    default 3.2e-4, with few views 1.6e-4."""
     lr_means_final: Weight = 1.6e-5
     """Learning rate of the means at the last step, times the scene extent."""
-    lr_quats: Weight = 1e-3
-    """Learning rate of the rotations."""
+    lr_quats: Weight | None = None
+    """Learning rate of the rotations; by default 4e-3, with few views 1e-3."""
     lr_log_scales: Weight = 1.5e-2
     """Learning rate of the logarithms of the scales."""
     lr_logit_opacities: Weight = 5e-2
     """Learning rate of the opacities before the sigmoid."""
     lr_sh0: Weight = 5e-3
     """Learning rate of the base color."""
-    lr_shN: Weight = 2.5e-4
-    """Learning rate of the view-dependent color."""
+    lr_shN: Weight | None = None
+    """Learning rate of the view-dependent color; by default 5e-4, with few views 2.5e-4."""
     lr_last: Annotated[float, Within(1e-6, 1)] = 0.1
     """Share of every rate at the last step: rates fall to it over the last 5 % of a run, except with few views; 1 keeps
     them."""
@@ -115,8 +118,8 @@ class OptimizerConfig:
     """Number added to the root of the mean squared gradient."""
     sh_degree: ShDegree = 3
     """Highest band of the spherical harmonics."""
-    sh_degree_every: PositiveCount = 1000
-    """Steps between two bands."""
+    sh_degree_every: PositiveCount | None = None
+    """Steps between two bands; by default 500, with few views 1000."""
 
     def __post_init__(self) -> None:
         check.fields(self, "optimizer")
@@ -146,26 +149,28 @@ class DensityConfig:
     """Number and place of the Gaussians."""
 
     strategy: Literal["adc", "mcmc"] = "adc"
-    """adc: clone, split, prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
+    """adc: split and prune by gradient (Kerbl et al. 2023); mcmc: relocate, grow to budget (Kheradmand 2024)."""
     max_gaussians: Annotated[int, Within(1, MAX_GAUSSIANS)] | None = None
     """Largest number of Gaussians; by default about 1.4 per pixel that shows something, more in longer runs."""
-    refine_start: Count = 500
-    """First step after which Gaussians are added and removed."""
+    refine_start: Count | None = None
+    """First step after which Gaussians are added and removed; by default 200, with few views and for mcmc 500."""
     refine_stop: Count | None = None
     """Last such step; by default min(15000, 60 % of iterations) for adc, min(25000, 83 %) for mcmc."""
-    refine_every: PositiveCount = 100
-    """Steps between two refinements."""
-    grow_grad2d: Weight = 2e-4
-    """adc: mean gradient of the projected center above which Gaussians grow (normalized device coordinates)."""
+    refine_every: PositiveCount | None = None
+    """Steps between two refinements; by default 50, with few views and for mcmc 100."""
+    grow_grad2d: Weight | None = None
+    """adc: mean gradient of the projected center above which Gaussians grow (normalized device coordinates); by default
+    1e-4, with few views 2e-4."""
     absgrad: bool = False
     """adc: absolute gradients (AbsGS); they need a larger grow_grad2d, about 8e-4."""
-    grow_scale3d: Weight = 0.01
-    """adc: scale above which Gaussians are split and below which they are cloned (fraction of the scene extent)."""
     prune_opacity: Annotated[float, Within(1e-6, 0.49)] = 0.005
     """Opacity below which adc removes Gaussians and mcmc moves them to where there is something to draw."""
     prune_scale3d: Weight = 0.1
     """adc: scale above which Gaussians are removed after the first opacity reset (fraction of the scene extent)."""
-    reset_every: Count = 3000
+    turnover: Annotated[float, Within(0, 0.9)] | None = None
+    """adc: share of the Gaussians, those that add least to the input views, that makes room for others three times in
+    the second half of refinement, where the budget is full; 0 = never. By default 0.2, with few views 0."""
+    reset_every: Count = 0
     """adc: steps between two opacity resets, none in the last 2000 steps; 0 = never."""
     noise_lr: Weight = 5e5
     """mcmc: strength of the position noise."""
@@ -288,8 +293,8 @@ class TrainConfig:
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     cell: CellConfig = field(default_factory=CellConfig)
     preset: Preset = "default"
-    """draft: 2000 steps with more skips; default: 7000 steps; high: 15,000 steps. Other settings win over it."""
-    iterations: PositiveCount = 7000
+    """draft: 2000 steps with more skips; default: 4000 steps; high: 15,000 steps. Other settings win over it."""
+    iterations: PositiveCount = 4000
     """Training steps; those of the preset by default, then with few views at most `sparse.steps_per_view` for each."""
     seed: Annotated[int, Within(0, 2**31 - 1)] = 0
     """Seed of every random number: same seed, same data, same bits."""
@@ -356,7 +361,12 @@ class TrainConfig:
             ) from error
         if not isinstance(document, dict) or not isinstance(document.get("config"), dict):
             raise InputError(f"{path} has no object `config`. Give the config.json that `gsopt train` wrote.")
-        return TrainConfig.from_dict(document["config"])
+        config = document["config"]
+        for section, names in GONE.items():
+            part = config.get(section)
+            if isinstance(part, dict):
+                config[section] = {key: value for key, value in part.items() if key not in names}
+        return TrainConfig.from_dict(config)
 
 
 def _merged(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

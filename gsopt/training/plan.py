@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from gsopt.config.cells import CellConfig
-from gsopt.config.train import DensityConfig, ExposureConfig, InitConfig, PoseConfig, SparseConfig, TrainConfig
+from gsopt.config.train import (
+    DensityConfig,
+    ExposureConfig,
+    InitConfig,
+    OptimizerConfig,
+    PoseConfig,
+    SparseConfig,
+    TrainConfig,
+)
 from gsopt.data.background import Background
 from gsopt.data.scene import Scene
 from gsopt.geometry.focus import find_focus
@@ -23,6 +31,18 @@ REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}
 # Shares of a run drawn at a quarter and at half of the resolution. Early steps only move coarse shapes; with few views
 # a longer coarse phase keeps fine detail from being learned as view-dependent fog (docs/decisions/0001-schedule.md).
 COARSE_SHARES, COARSE_SHARES_SPARSE = (0.06, 0.23), (1 / 6, 1 / 2)
+# Settings that are left open, with many views and with few: few views are learned more slowly, and nothing makes room
+# for what they show better at the cost of what other views need (docs/decisions/0019-fewer-steps.md).
+BY_VIEWS: dict[str, tuple[float, float]] = {
+    "lr_means": (3.2e-4, 1.6e-4),
+    "lr_quats": (4e-3, 1e-3),
+    "lr_shN": (5e-4, 2.5e-4),
+    "sh_degree_every": (500, 1000),
+    "refine_start": (200, 500),
+    "refine_every": (50, 100),
+    "grow_grad2d": (1e-4, 2e-4),
+    "turnover": (0.2, 0.0),
+}
 # The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
 GAUSSIANS_PER_PIXEL = 1.44
 MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
@@ -60,11 +80,11 @@ class DensityPlan:
     max_gaussians: int
     grow_grad2d: float
     absgrad: bool
-    split_scale: float
-    """adc: split above, clone below this scale, scene units."""
     prune_opacity: float
     prune_scale: float
     """adc: remove larger ones after the first opacity reset, scene units."""
+    turnover: float
+    """adc: share that adds least to the input views, removed now and then; 0 = never."""
     noise_lr: float
     growth: float
 
@@ -122,7 +142,7 @@ class RunPlan:
             cell=config.cell,
             weights=loss_weights(config, sparse, scene.has_alpha),
             schedule=schedule,
-            density=density_plan(config.density, budget, scene.extent),
+            density=density_plan(config.density, budget, sparse, scene.extent),
             poses=config.poses,
             exposure=config.exposure,
             prior=select_prior(config.guidance),
@@ -176,21 +196,35 @@ def make_schedule(config: TrainConfig, iterations: int, sparse: bool, extent: fl
     """The schedule of a run of so many steps. No rate falls at the end with few views, where the noise of single steps
     acts as a regularizer against overfitting (docs/decisions/0001-schedule.md); few views cannot tell view dependence
     from shape, so that they get fewer bands."""
-    density, degree = config.density, config.optimizer.sh_degree
+    density, optimizer = growth_settings(config.density, sparse), by_views(config.optimizer, sparse)
+    degree = config.optimizer.sh_degree
     return Schedule(
         iterations=iterations,
         extent=extent,
-        optimizer=config.optimizer,
+        optimizer=replace(config.optimizer, **optimizer),
+        lr_means_first=optimizer["lr_means"],
+        sh_degree_every=optimizer["sh_degree_every"],
         settling=0 if sparse else math.ceil(SETTLING_SHARE * iterations),
         coarse_until=coarse_until(config.schedule.coarse_until, iterations, sparse),
         max_sh_degree=min(degree, config.sparse.sh_degree) if sparse else degree,
-        refine_start=density.refine_start,
-        refine_stop=refine_stop(density, iterations),
-        refine_every=density.refine_every,
-        reset_every=density.reset_every,
+        refine_start=density["refine_start"],
+        refine_stop=refine_stop(config.density, iterations),
+        refine_every=density["refine_every"],
+        reset_every=config.density.reset_every,
         max_dropout=config.sparse.dropout if sparse else 0.0,
         floater_every=config.sparse.floater_every if sparse else 0,
     )
+
+
+def by_views(section: OptimizerConfig | DensityConfig, sparse: bool) -> dict[str, Any]:
+    """The settings of a section that the number of views decides where they are left open."""
+    given = {name: getattr(section, name) for name in BY_VIEWS if hasattr(section, name)}
+    return {name: BY_VIEWS[name][sparse] if value is None else value for name, value in given.items()}
+
+
+def growth_settings(config: DensityConfig, sparse: bool) -> dict[str, Any]:
+    """Those of density control; mcmc, whose growth is a share per refinement, refines as rarely as with few views."""
+    return by_views(config, sparse or config.strategy == "mcmc")
 
 
 def coarse_until(given: tuple[int, ...] | None, iterations: int, sparse: bool) -> tuple[int, ...]:
@@ -226,16 +260,17 @@ def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool) -> LossWeig
     return LossWeights(loss.lambda_dssim, *raised, loss.lambda_depth, few.lambda_unseen)
 
 
-def density_plan(config: DensityConfig, budget: int, extent: float) -> DensityPlan:
+def density_plan(config: DensityConfig, budget: int, sparse: bool, extent: float) -> DensityPlan:
     """The parameters of density control; lengths in scene units."""
+    settings = growth_settings(config, sparse)
     return DensityPlan(
         strategy=config.strategy,
         max_gaussians=budget,
-        grow_grad2d=config.grow_grad2d,
+        grow_grad2d=settings["grow_grad2d"],
         absgrad=config.absgrad,
-        split_scale=config.grow_scale3d * extent,
         prune_opacity=config.prune_opacity,
         prune_scale=config.prune_scale3d * extent,
+        turnover=settings["turnover"] if config.strategy == "adc" else 0.0,
         noise_lr=config.noise_lr,
         growth=config.growth,
     )

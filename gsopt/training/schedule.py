@@ -10,6 +10,8 @@ from gsopt.training.optimizer import learning_rates
 
 STEPS_AFTER_RESET = 2000
 """Steps that opacities need to recover from a reset: none is made later than this before the end."""
+TURNOVERS = (1 / 2, 2 / 3, 5 / 6)
+"""Shares of the steps up to the last refinement after which what adds least to the input views makes room."""
 FLOATER_SIGMAS = (4.0, 2.0)
 """Distance of a floater to its neighbors beyond the mean, in standard deviations, at the first and the last step."""
 
@@ -22,6 +24,11 @@ class Schedule:
     extent: float
     """Extent of the scene, scene units: the unit of the rates of the means."""
     optimizer: OptimizerConfig
+    """With nothing left open."""
+    lr_means_first: float
+    """Learning rate of the means at the first step, over the extent."""
+    sh_degree_every: int
+    """Steps between two bands of the spherical harmonics."""
     settling: int
     """Number of last steps in which the learning rates fall."""
     coarse_until: tuple[int, ...]
@@ -51,7 +58,7 @@ class Schedule:
 
     def lr_means(self, step: int) -> float:
         """Log-linear from lr_means to lr_means_final, times the scene extent: scene units per step."""
-        first, last = self.optimizer.lr_means, self.optimizer.lr_means_final
+        first, last = self.lr_means_first, self.optimizer.lr_means_final
         if first <= 0 or last <= 0:
             return 0.0
         return self.extent * first * (last / first) ** (step / self.iterations)
@@ -63,7 +70,7 @@ class Schedule:
 
     def sh_degree(self, step: int) -> int:
         """Highest band that is drawn: one more every `sh_degree_every` steps. 0 before the first step."""
-        return min(self.max_sh_degree, max(0, step - 1) // self.optimizer.sh_degree_every)
+        return min(self.max_sh_degree, max(0, step - 1) // self.sh_degree_every)
 
     def downscale(self, step: int) -> int:
         """Divisor of width and height: halved for every entry of `coarse_until` that the step has passed."""
@@ -78,6 +85,11 @@ class Schedule:
         if self.reset_every == 0 or step % self.reset_every != 0:
             return False
         return step <= min(self.refine_stop, self.iterations - STEPS_AFTER_RESET)
+
+    def turns_over(self, step: int) -> bool:
+        """True when Gaussians that add little to the input views make room after this step, for those added then."""
+        due = (round(share * self.refine_stop / self.refine_every) * self.refine_every for share in TURNOVERS)
+        return self.refines(step) and step in due
 
     def prunes_large(self, step: int) -> bool:
         """True once opacities were reset: from then on adc removes large Gaussians."""
@@ -105,7 +117,7 @@ class Schedule:
 
     def is_complete(self, step: int) -> bool:
         """True once moreover all bands are drawn: from here on a flat loss may end the run."""
-        return self.is_settled(step) and step > self.max_sh_degree * self.optimizer.sh_degree_every
+        return self.is_settled(step) and step > self.max_sh_degree * self.sh_degree_every
 
 
 @dataclass

@@ -19,6 +19,7 @@ from gsopt.training.averaging import RunningAverage
 from gsopt.training.checkpoint import Checkpoint
 from gsopt.training.content_window import draws_whole
 from gsopt.training.density import at_least_one, make_density
+from gsopt.training.density.contribution import contributions, least
 from gsopt.training.exposure import Exposure
 from gsopt.training.floaters import solitary
 from gsopt.training.frame_loss import frame_loss
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 # The parts of a model that a checkpoint carries.
 RECORDS = ("gaussians", "exp_avg", "exp_avg_sq")
+# Share of the budget from which on what adds least makes room: below it, growth has room of its own.
+FULL = 0.95
 
 
 class Trainer:
@@ -65,7 +68,7 @@ class Trainer:
         self._order = ViewOrder(views, self._generators["views"], images, plan.extra_per_epoch)
         self._flatness = Flatness.of(views + plan.extra_per_epoch)
         self._resting = Resting(views + images)
-        self._bands = Bands(plan.schedule.optimizer.sh_degree_every, plan.schedule.max_sh_degree)
+        self._bands = Bands(plan.schedule.sh_degree_every, plan.schedule.max_sh_degree)
         cache = int(plan.target_cache_mb * 1e6)
         self._targets = Targets(scene.drawn, plan.background.constant(), cache, backend.device)
         self.model = OptimizedGaussians.start(self._first(gaussians).to(backend.device))
@@ -182,6 +185,8 @@ class Trainer:
         """Add, remove and reorder Gaussians where this step asks for it, and take the next band when it is due."""
         if self.plan.residual_bands:
             self._bands.decide(self.step)
+        if self._schedule.turns_over(self.step):
+            self._make_room()
         refined = self._density.refine(self.step, self.model)
         moved = refined is not self.model
         self.model = refined
@@ -195,6 +200,14 @@ class Trainer:
             self._bands.forget()
             if self._guidance is not None:
                 self._guidance.forget()
+
+    def _make_room(self) -> None:
+        """Remove what adds least to the input views where nothing can grow for want of room."""
+        density = self.plan.density
+        if density.turnover > 0 and len(self.model) >= FULL * density.max_gaussians:
+            cameras = [view.camera.to(torch.float32) for view in self.scene.train]
+            values = contributions(self.model.gaussians, cameras, self.backend, antialiased=self.plan.antialiased)
+            self._select(~least(values, density.turnover))
 
     def _select(self, rows: Tensor) -> None:
         self.model = self.model.select(rows)

@@ -147,7 +147,7 @@ def test_gsopt_takes_the_flags(
     config, run = read_flags(parse(words[4:]))
     assert config.preset == (training.preset or "default")
     preset = PRESETS[training.preset or "default"]
-    own = training if not training.preset else arguments.Training(iterations=preset.get("iterations", 7000))
+    own = training if not training.preset else arguments.Training(iterations=preset.get("iterations", 4000))
     assert (config.iterations, config.data.downscale, config.seed) == (own.iterations, own.downscale, training.seed)
     assert (config.data.views or 0, config.density.max_gaussians or 0) == (training.views, training.max_gaussians)
     assert (config.density.strategy, config.data.background) == (own.strategy, own.background)

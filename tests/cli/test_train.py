@@ -111,7 +111,7 @@ def test_every_flag_sets_its_setting_and_no_other(flags: str, key: str, value: o
 
 
 def test_steps_that_are_given_are_meant_and_those_of_a_preset_are_what_few_views_may_shorten() -> None:
-    for flags, steps, bound in (("", 7000, 500), ("--preset high", 15_000, 500), ("--iterations 7000", 7000, 0)):
+    for flags, steps, bound in (("", 4000, 500), ("--preset high", 15_000, 500), ("--iterations 7000", 7000, 0)):
         config = config_of(flags)
         assert (config.iterations, config.sparse.steps_per_view) == (steps, bound)
 
@@ -145,7 +145,7 @@ def test_every_setting_has_one_flag_with_its_default_and_help(capsys: pytest.Cap
     ("argv", "error"),
     [
         ("--resolution 0", "`--resolution` must be at least 1, got 0. Leave it out for the default of 1."),
-        ("--iterations 0", "`--iterations` must be at least 1, got 0. Leave it out for the default of 7000."),
+        ("--iterations 0", "`--iterations` must be at least 1, got 0. Leave it out for the default of 4000."),
         ("--optimizer.lr_last 2", "`--optimizer.lr-last` must lie in [1e-06, 1], got 2.0."),
         ("--views 2 --view-ids 1", "`--views` and `--view-ids` were both given. Keep one of them."),
         ("--guidance.t-max 0.01", "`--guidance.t-max` must not lie below `--guidance.t-min`, got 0.01 and 0.02."),

@@ -45,6 +45,15 @@ def test_json_and_back_is_the_identity(views, steps, rate, stop, seed, path) -> 
     assert TrainConfig.from_dict(json.loads(text)) == config
 
 
+def test_a_run_of_an_older_version_is_read_without_settings_that_are_gone(tmp_path: Path) -> None:
+    older = TrainConfig(iterations=12).to_dict()
+    older["density"]["grow_scale3d"] = 0.01
+    (tmp_path / "config.json").write_text(json.dumps({"config": older}))
+    assert TrainConfig.read(tmp_path / "config.json") == TrainConfig(iterations=12)
+    with pytest.raises(InputError, match="grow_scale3d"):
+        TrainConfig.from_dict(older)
+
+
 def test_an_empty_object_is_the_default() -> None:
     assert TrainConfig.from_dict({}) == TrainConfig()
 

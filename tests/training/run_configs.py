@@ -47,6 +47,11 @@ def configs(dataset: Path) -> dict[str, TrainConfig]:
     return {
         "adc": replace(base, sparse=SparseConfig(below_views=0)),
         "mcmc": replace(base, density=mcmc, sparse=SparseConfig(below_views=0)),
+        "turnover": replace(
+            base,
+            density=replace(base.density, turnover=0.3, max_gaussians=61),
+            sparse=SparseConfig(below_views=0),
+        ),
         "few views": replace(base, sparse=SparseConfig(floater_every=7)),
         "random background": replace(base, data=DataConfig(path=str(dataset), background="random")),
         "reference backend": replace(base, backend="reference"),

@@ -22,7 +22,8 @@ CONFIG = DensityConfig(strategy="mcmc", refine_start=0, refine_every=10, refine_
 
 def controlled(config: DensityConfig = CONFIG) -> Mcmc:
     schedule = make_schedule(TrainConfig(density=config), 1000, sparse=False, extent=1.0)
-    return Mcmc(density_plan(config, config.max_gaussians or 10**6, 1.0), schedule, torch.Generator().manual_seed(0))
+    plan = density_plan(config, config.max_gaussians or 10**6, sparse=False, extent=1.0)
+    return Mcmc(plan, schedule, torch.Generator().manual_seed(0))
 
 
 def paper_factor(opacity: float, n: int) -> float:

@@ -12,7 +12,7 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Gradients, RasterSettings
 from gsopt.training.optimizer import OptimizedGaussians, adam_step, learning_rates
 
-CONFIG = OptimizerConfig()
+CONFIG = OptimizerConfig(lr_means=1e-3, lr_quats=4e-3, lr_shN=5e-4)
 RATES = learning_rates(CONFIG, 1e-3)
 
 

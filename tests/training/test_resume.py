@@ -44,6 +44,7 @@ class Killed(BaseException):
 
 NAMES = (
     "adc",
+    "turnover",
     "mcmc",
     "few views",
     "random background",

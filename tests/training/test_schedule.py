@@ -27,7 +27,7 @@ def made(config: TrainConfig, *, views: int = 100, extent: float = 1.0) -> Sched
 def test_the_rate_of_the_means_ends_where_it_should_and_falls_by_the_same_factor_every_step() -> None:
     run = made(TrainConfig(iterations=500), extent=2.0)
     rates = [run.lr_means(step) for step in range(501)]
-    assert rates[0] == pytest.approx(2 * OPTIMIZER.lr_means)
+    assert rates[0] == pytest.approx(2 * plan.BY_VIEWS["lr_means"][0])
     assert rates[-1] == pytest.approx(2 * OPTIMIZER.lr_means_final)
     factors = {round(after / before, 9) for before, after in itertools.pairwise(rates)}
     assert len(factors) == 1
@@ -47,6 +47,19 @@ def test_bands_come_one_by_one_and_never_pass_the_highest(step: int, every: int,
     assert later == min(now + 1, highest)
 
 
+def test_few_views_are_learned_more_slowly_and_what_is_given_stays() -> None:
+    few, many = made(TrainConfig(), views=4), made(TrainConfig())
+    assert few.lr_means(0) < many.lr_means(0)
+    assert few.refine_every > many.refine_every
+    assert few.learning_rates(1, 4000)["quats"] < many.learning_rates(1, 4000)["quats"]
+    assert plan.density_plan(DensityConfig(), 100, True, 1.0).turnover == 0
+    given = TrainConfig(optimizer=OptimizerConfig(lr_quats=0.5), density=DensityConfig(refine_every=7, turnover=0.1))
+    for views in (4, 100):
+        run = made(given, views=views)
+        assert (run.learning_rates(1, 4000)["quats"], run.refine_every) == (0.5, 7)
+    assert plan.density_plan(given.density, 100, True, 1.0).turnover == 0.1
+
+
 def test_resolution_doubles_at_every_entry_and_ends_full() -> None:
     run = made(TrainConfig())
     assert [replace(run, coarse_until=(2, 4)).downscale(step) for step in range(1, 7)] == [4, 4, 2, 2, 1, 1]
@@ -63,7 +76,7 @@ def test_refinement_ends_as_published_or_sooner_in_a_short_run(strategy: str, it
     assert run.refine_stop == stop
     assert run.refines(stop - stop % 100)
     assert not run.refines(stop - stop % 100 + 100)
-    assert not run.refines(config.refine_start)
+    assert not run.refines(run.refine_start)
 
 
 def test_a_given_end_of_refinement_is_kept() -> None:

@@ -1,4 +1,4 @@
-"""Density control, the number and places of the Gaussians: one protocol, two published strategies."""
+"""Density control, the number and places of the Gaussians: one protocol, two strategies."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def make_density(
         return Mcmc(plan, schedule, generator)
     from gsopt.training.density.adc import Adc
 
-    return Adc(plan, schedule, count, generator, device)
+    return Adc(plan, schedule, count, device)
 
 
 def at_least_one(keep: Bool[Tensor, "N"], scores: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:

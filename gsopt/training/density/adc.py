@@ -1,4 +1,8 @@
-"""Adaptive density control (Kerbl et al. 2023, section 5): clone, split, prune and reset, within a budget."""
+"""Adaptive density control (Kerbl et al. 2023, section 5): split, prune and reset, within a budget.
+
+The published rule clones small Gaussians and splits large ones at random; here all split alike, along the longest axis
+(Deng et al. 2025, "Improving Densification in 3D Gaussian Splatting"), so that the halves look like the whole at first.
+"""
 
 from __future__ import annotations
 
@@ -15,23 +19,19 @@ from gsopt.raster.backend import Gradients
 from gsopt.training.density import at_least_one
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
-from gsopt.training.randomness import normal
 from gsopt.training.schedule import Schedule
 
-# A split Gaussian becomes two whose scales are divided by this (Kerbl et al. 2023, section 5.2).
-SPLIT_SHRINK = 1.6
+# A half along the axis that is split, and the distance of its center from the whole's: shares of the whole's scale.
+HALF_LENGTH, HALF_DISTANCE = 0.6, 0.8
 CPU = torch.device("cpu")
 
 
 class Adc:
     """Grows where the image pulls hard on a projected center, prunes what is transparent or too large."""
 
-    def __init__(
-        self, plan: DensityPlan, schedule: Schedule, count: int, generator: torch.Generator, device: torch.device = CPU
-    ) -> None:
+    def __init__(self, plan: DensityPlan, schedule: Schedule, count: int, device: torch.device = CPU) -> None:
         self._plan = plan
         self._schedule = schedule
-        self._generator = generator
         self._device = device
         self._forget(count)
 
@@ -73,17 +73,13 @@ class Adc:
         self.grad_sum, self.seen = (tensors[name].to(self._device) for name in ("grad_sum", "seen"))
 
     def _grow_and_prune(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
-        """Clone small Gaussians and split large ones where the mean gradient is above the threshold; prune both."""
+        """Split what stays where its mean gradient is above the threshold."""
         gaussians = model.gaussians
         scores = self.grad_sum / self.seen.clamp_min(1)
         room = max(0, self._plan.max_gaussians - len(model))
-        growing = best(scores > self._plan.grow_grad2d, scores, room)
-        splitting = growing & (largest_scales(gaussians) > self._plan.split_scale)
         keep = at_least_one(self._keep(step, gaussians), gaussians.logit_opacities)
-        halves = split(gaussians.select(splitting), self._generator)
-        halves = halves.select(self._keep(step, halves))
-        clones = gaussians.select(growing & ~splitting & keep)
-        return model.select(keep & ~splitting).append(clones.append(halves))
+        splitting = best((scores > self._plan.grow_grad2d) & keep, scores, room)
+        return model.select(keep & ~splitting).append(split(gaussians.select(splitting)))
 
     def _keep(self, step: int, gaussians: Gaussians) -> Bool[Tensor, "N"]:
         """Neither transparent nor, once opacities were reset, huge."""
@@ -108,12 +104,15 @@ def largest_scales(gaussians: Gaussians) -> Float[Tensor, "N"]:
     return gaussians.log_scales.amax(dim=1).exp()
 
 
-def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
-    """Two smaller Gaussians for each one, their centers drawn from it."""
-    twice = gaussians.append(gaussians)
-    local = normal(len(twice), 3, generator=generator, device=twice.means.device) * twice.scales
-    offsets = (quaternions.rotation_matrices(twice.quats) @ local[..., None])[..., 0]
-    return replace(twice, means=twice.means + offsets, log_scales=twice.log_scales - math.log(SPLIT_SHRINK))
+def split(gaussians: Gaussians) -> Gaussians:
+    """Two halves for each one, side by side along its longest axis; all first halves, then all second ones."""
+    longest = gaussians.log_scales.argmax(dim=1, keepdim=True)
+    along = HALF_DISTANCE * gaussians.log_scales.gather(1, longest).exp()
+    local = torch.zeros_like(gaussians.means).scatter(1, longest, along)
+    offsets = (quaternions.rotation_matrices(gaussians.quats) @ local[..., None])[..., 0]
+    shrunk = torch.zeros_like(local).scatter(1, longest, math.log(HALF_LENGTH))
+    first = replace(gaussians, means=gaussians.means + offsets, log_scales=gaussians.log_scales + shrunk)
+    return first.append(replace(first, means=gaussians.means - offsets))
 
 
 def lower_opacities(model: OptimizedGaussians, opacity: float) -> None:

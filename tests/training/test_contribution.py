@@ -1,0 +1,83 @@
+"""Laws of what Gaussians add to the input views, and of those that make room for growth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_scenes import cloud, ring
+
+from gsopt.config.train import DensityConfig, TrainConfig
+from gsopt.gaussians import Gaussians
+from gsopt.raster.api import make_backend
+from gsopt.raster.backend import RasterSettings
+from gsopt.training import plan
+from gsopt.training.density import contribution
+from gsopt.training.density.contribution import contributions, least
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_all_contributions_add_up_to_the_alphas_of_all_views(backend: str) -> None:
+    gaussians, cameras, drawn_by = cloud(30, seed=3), ring(4, 1.0), make_backend(backend)
+    found = contributions(gaussians, [cameras[i] for i in range(4)], drawn_by, antialiased=False)
+    alphas = [drawn_by.forward(gaussians, cameras[i], RasterSettings()).alphas.sum() for i in range(4)]
+    torch.testing.assert_close(found.sum(), torch.stack(alphas).sum(), rtol=1e-4, atol=1e-4)
+    assert bool((found >= 0).all())
+
+
+def test_the_color_of_a_gaussian_does_not_matter() -> None:
+    gaussians, cameras = cloud(30, seed=3), [ring(2, 1.0)[0]]
+    black = replace(gaussians, sh0=torch.full_like(gaussians.sh0, -9.0))
+    found = [contributions(one, cameras, make_backend("cpu"), antialiased=False) for one in (gaussians, black)]
+    assert torch.equal(*found)
+
+
+def test_what_lies_behind_others_adds_next_to_nothing() -> None:
+    """Ten opaque ones on the line to the only camera: the farthest adds less than all others."""
+    camera = ring(1, 0.0)[0]
+    base = cloud(10, seed=1)
+    toward = camera.centers[0].float() / camera.centers[0].float().norm()
+    row = Gaussians(
+        means=torch.linspace(0.5, -0.5, 10)[:, None] * toward,
+        quats=base.quats,
+        log_scales=torch.full((10, 3), math.log(0.1)),
+        logit_opacities=torch.full((10,), 3.0),
+        sh0=base.sh0,
+        shN=base.shN,
+    )
+    found = contributions(row, [camera], make_backend("cpu"), antialiased=False)
+    assert found.argmax() == 0
+    assert least(found, 0.1).nonzero().flatten().tolist() == [9]
+
+
+def test_no_more_views_are_looked_at_than_needed_evenly_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians, cameras = cloud(20, seed=5), ring(6, 1.0)
+    monkeypatch.setattr(contribution, "MAX_VIEWS", 3)
+    backend = make_backend("cpu")
+    found = contributions(gaussians, [cameras[i] for i in range(6)], backend, antialiased=False)
+    wanted = contributions(gaussians, [cameras[i] for i in (0, 2, 4)], backend, antialiased=False)
+    assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.25, 2), (0.9, 7), (1.0, 7)])
+def test_the_lowest_go_first_in_row_order_and_one_always_stays(share: float, count: int) -> None:
+    values = torch.tensor([3.0, 0.0, 5.0, 1.0, 1.0, 9.0, 2.0, 4.0])
+    gone = least(values, share)
+    order = [1, 3, 4, 6, 0, 7, 2]
+    assert set(gone.nonzero().flatten().tolist()) == set(order[:count])
+
+
+def test_room_is_made_three_times_in_the_second_half_of_refinement() -> None:
+    config = TrainConfig()
+    schedule = plan.make_schedule(config, config.iterations, sparse=False, extent=1.0)
+    due = [step for step in range(1, config.iterations + 1) if schedule.turns_over(step)]
+    assert len(due) == 3
+    assert schedule.refine_stop / 2 <= min(due) <= max(due) < schedule.refine_stop
+
+
+def test_only_adc_makes_room() -> None:
+    adc = DensityConfig(turnover=0.2)
+    assert plan.density_plan(adc, 100, False, 1.0).turnover == 0.2
+    assert plan.density_plan(replace(adc, strategy="mcmc"), 100, False, 1.0).turnover == 0
