@@ -14,14 +14,22 @@ PUBLISHED_SETTINGS = (
     *("--optimizer.lr-means", "1.6e-4"),
     *("--optimizer.lr-means-final", "1.6e-6"),
     *("--optimizer.lr-last", "1"),
+    *("--optimizer.lr-quats", "1e-3"),
     *("--optimizer.lr-log-scales", "5e-3"),
     *("--optimizer.lr-sh0", "2.5e-3"),
     *("--optimizer.lr-shN", "1.25e-4"),
+    *("--optimizer.sh-degree-every", "1000"),
+    *("--density.refine-start", "500"),
+    *("--density.refine-every", "100"),
+    *("--density.grow-grad2d", "2e-4"),
+    *("--density.turnover", "0"),
+    *("--density.reset-every", "3000"),
     "--schedule.coarse-until",
     *("--max-gaussians", "1000000"),
 )
 """The settings of Kerbl et al. 2023: 100,000 random points (groups of real captures add `--init points`), their
-learning rates, full resolution from the first step, no regularizer for few views, no guidance."""
+learning rates and density control, full resolution from the first step, no regularizer for few views, no guidance. Here
+too, Gaussians that grow are halved and not cloned (docs/decisions/0019-fewer-steps.md)."""
 
 ARMS: dict[str, tuple[str, ...]] = {
     "3dgs": PUBLISHED_SETTINGS,
