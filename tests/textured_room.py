@@ -14,7 +14,7 @@ from gsopt.geometry.cameras import look_at
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 TEXTURE = 512
-QUICK = SfmConfig(max_features=1200, threads=1)
+QUICK = SfmConfig(features="sift", max_features=1200, threads=1)
 """Finds the poses of these photos in a few seconds."""
 Corners = tuple[tuple[float, float, float], ...]
 # Each plane: the world positions of its texture's corners (top left, top right, bottom right, bottom left).

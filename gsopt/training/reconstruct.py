@@ -159,7 +159,7 @@ def _with_poses(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
     """
     data, features = Path(config.data.path), config.data.features
     if not needs_poses(data):
-        if features != "sift":
+        if features in ("xfeat", "both"):
             log(f"{data} has poses: `--features {features}` changes nothing")
         return config
     masks = "auto" if config.data.masks == "given" else config.data.masks

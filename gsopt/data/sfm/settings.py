@@ -38,9 +38,10 @@ class SfmConfig:
     """Focal length in pixels of the full-size photos, if known: it is kept. Read from EXIF when not given."""
     max_size: int = 1600
     """Features are looked for in a copy whose longer side is at most this, px."""
-    features: Features = "sift"
+    features: Features = "auto"
     """sift; xfeat, learned features and a learned matcher (pip install 'gsopt[match]'), which find more on smooth
-    surfaces and from the side, at 3 s a pair; or both, joined before the geometry is verified."""
+    surfaces and from the side, at 3 s a pair; or both, joined before the geometry is verified. auto takes both for 3 to
+    16 photos where the learned ones are installed, sift otherwise."""
     max_features: int = 4096
     """Most SIFT features per photo."""
     frames: int = 150
@@ -57,7 +58,7 @@ class SfmConfig:
         check.one_of("--matching", self.matching, ("auto", "exhaustive", "sequential", "retrieval"))
         check.one_of("--poses", self.poses, ("find", "prior"))
         check.within("--max-size", self.max_size, 64, MAX_SIDE, "The default is 1600.")
-        check.one_of("--features", self.features, ("sift", "xfeat", "both"))
+        check.one_of("--features", self.features, ("auto", "sift", "xfeat", "both"))
         check.within("--max-features", self.max_features, 64, MAX_FEATURES, "The default is 4096.")
         check.within("--frames", self.frames, 3, 100_000, "The default is 150.")
         check.within("--seed", self.seed, 0, 2**31 - 1, "Give a whole number in that range.")
@@ -66,7 +67,7 @@ class SfmConfig:
             check.within("--focal", self.focal, 1.0, 1e6, "Drop the flag to read it from EXIF or to find it.")
         if self.focal is not None and self.poses == "prior":
             raise UsageError("`--focal` and `--poses prior` were both given. Keep one: the prior has its own focal.")
-        if self.features != "sift" and self.matching not in ("auto", "exhaustive"):
+        if self.features in ("xfeat", "both") and self.matching not in ("auto", "exhaustive"):
             raise UsageError(
                 f"`--features {self.features}` compares all with all, got `--matching {self.matching}`. Drop one."
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,10 +17,11 @@ import textured_room as room
 from PIL import Image
 
 from gsopt.cli import main
+from gsopt.data.sfm import pipeline
 from gsopt.data.sfm.features import ColmapProject, extract
 from gsopt.data.sfm.joined_features import PARTNERS, alike, join, joined_matches, learned_matches, match_joined
 from gsopt.data.sfm.learned_features import LearnedFeatures, LearnedMatcher, lookalikes
-from gsopt.data.sfm.photos import find_photos, read_photos
+from gsopt.data.sfm.photos import Photo, find_photos, read_photos
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import InputError, MissingDependency, UsageError
 
@@ -135,6 +136,36 @@ def test_photos_are_compared_with_those_that_look_like_them() -> None:
     assert all(a[0] == b[0] for a, b in pairs)
     nothing = LearnedFeatures(np.zeros((0, 2)), np.zeros((0, 64), np.float32), (10, 10))
     assert lookalikes(nothing, features["00"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("count", "source", "settings", "installed", "want"),
+    [
+        (3, "photos", {}, True, "both"),
+        (16, "photos", {}, True, "both"),
+        (17, "photos", {}, True, "sift"),
+        (3, "photos", {}, False, "sift"),
+        (3, "film.mp4", {}, True, "sift"),
+        (3, "photos", {"poses": "prior"}, True, "sift"),
+        (3, "photos", {"matching": "sequential"}, True, "sift"),
+        (3, "photos", {"features": "sift"}, True, "sift"),
+        (99, "photos", {"features": "xfeat"}, False, "xfeat"),
+    ],
+)
+def test_few_photos_get_learned_features_too_where_they_are_installed(
+    count: int,
+    source: str,
+    settings: dict[str, Any],
+    installed: bool,
+    want: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pipeline, "find_spec", lambda name: object() if installed else None)
+    (tmp_path / source).touch()
+    run = pipeline._Run(pycolmap, tmp_path / source, tmp_path, SfmConfig(**settings), lambda line: None)
+    photos = [cast("Photo", object())] * count
+    assert run._chosen_features(photos) == want
 
 
 @pytest.mark.parametrize("name", ["orb", "SIFT", ""])

@@ -186,6 +186,7 @@ def test_a_scene_of_other_features_or_masks_is_not_taken_again(room_photos: Path
     chosen = replace(room.QUICK, masks=str(masks))
     scene = pose_photos(room_photos, tmp_path / "scene", chosen).path
     assert made_from(scene, room_photos, chosen)
+    assert made_from(scene, room_photos, replace(chosen, features="auto"))
     for other in (replace(chosen, features="both"), replace(chosen, masks="auto"), replace(chosen, seed=1)):
         assert not made_from(scene, room_photos, other)
     next(masks.iterdir()).unlink()
