@@ -1,8 +1,8 @@
 """Repair of masks that disagree with the others: the hull of the others says where, the colors say what.
 
 Within the projection of the hull a pixel belongs to the object where its color is more frequent in the agreeing
-silhouettes than in this photo's surroundings. If the outcome disagrees again, the whole projection is taken: it can
-carve nothing away.
+silhouettes than in this photo's surroundings; pixels without an edge between them go the same way. If the outcome
+disagrees again, the whole projection is taken: it can carve nothing away.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from gsopt.data.scene import PixelStore, Scene, View, load_scene
 from gsopt.geometry.focus import find_focus
 from gsopt.init.mask_agreement import MIN_COVERED, MIN_MASKS, Agreement, has_edge, mask_agreement
 from gsopt.init.mask_parts import cleaned
+from gsopt.init.random_walker import walked
 from gsopt.init.thumbnails import Thumbnail, small_photos
 
 MAX_CHECKED = 32
 """Most masks that are checked: the time grows with their square, and among more one is lost without harm."""
 LEVELS = 16
 """Bins of a color histogram along each channel."""
-SMOOTHING = 0.01
-"""Half the width of the window over which the evidence of neighboring pixels is averaged, image widths."""
+SOLID = 0.4
+"""Probability from which on a pixel belongs to the object: below a half, since the surroundings of the hull are certain
+and pull, and nothing is certain of the object."""
 THICKNESS = 1.0
 """Weight of the logarithm of the hull's thickness (over its mean) in the evidence: where the hull is thin, it is
 rather what few silhouettes left beside the object."""
 LEAST_EVIDENCE = 0.1
-"""Mean log-likelihood ratio below which colors tell nothing."""
+"""Divergence (Kullback & Leibler 1951) of the object's colors from its surroundings' below which they tell nothing."""
 LEAST_SHARE = 0.3
 """Share of the hull's projection that a mask found by colors covers at least; less of it is a failure of the colors."""
 KINDS = {
@@ -154,26 +156,17 @@ def _colored_part(
 ) -> Bool[Tensor, "H W"]:
     """The largest part of the hull's projection that has the object's colors; with the mask's word where it can be
     taken. Empty where colors tell nothing."""
-    evidence = _evidence(colors, inside, _histogram(colors[:, ~hull].T))
-    if float(evidence[hull].abs().mean()) < LEAST_EVIDENCE:
+    evidence = (inside / _histogram(colors[:, ~hull].T)).log()
+    if float(inside @ evidence) < LEAST_EVIDENCE:
         return torch.zeros_like(hull)
-    likely = evidence + THICKNESS * thickness.clamp_min(1e-3).log() > 0
+    by_pixel = evidence[_bins(colors.flatten(1).T)].view(hull.shape)
+    likely = torch.sigmoid(by_pixel + THICKNESS * thickness.clamp_min(1e-3).log()) * hull
     solid = photo.planes[3] > 127
     if kind == "too large":
-        likely &= solid
+        likely *= solid
     if kind == "lost":
-        likely |= solid
-    return cleaned(likely & hull)
-
-
-def _evidence(
-    colors: UInt8[Tensor, "3 H W"], inside: Float[Tensor, "B"], outside: Float[Tensor, "B"]
-) -> Float[Tensor, "H W"]:
-    """Log-likelihood ratio of the object against its surroundings by color, the mean over a small window."""
-    bins = _bins(colors.flatten(1).T)
-    evidence = (inside[bins] / outside[bins]).log().view(1, 1, *colors.shape[1:])
-    reach = max(1, round(SMOOTHING * colors.shape[2]))
-    return torch.nn.functional.avg_pool2d(evidence, 2 * reach + 1, 1, reach, count_include_pad=False)[0, 0]
+        likely[solid & hull] = 1
+    return cleaned((walked(colors, likely) > SOLID) & hull)
 
 
 def _object_colors(photo: Thumbnail) -> UInt8[Tensor, "N 3"]:

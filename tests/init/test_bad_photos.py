@@ -1,5 +1,5 @@
 """Photos with masks as people take them: a background that moves, an object that the frame cuts off, a photo that does
-not show it."""
+not show it, two objects, masks of another size."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from balls import Ball, picture, ring
 from PIL import Image
 from test_mask_agreement import SIZE, photos
 from tiny_scenes import tiny_config
@@ -23,7 +24,9 @@ pytestmark = pytest.mark.usefixtures("coarse_hull")
 
 COUNT = 5
 CUT = 1
-"""The photo that cuts the object off, or looks elsewhere."""
+"""The photo that cuts the object off, looks elsewhere, or whose mask lacks one of two objects."""
+APART = [Ball((-0.55, 0, 0), 0.3), Ball((0.55, 0, 0.1), 0.3)]
+"""Two objects."""
 
 
 def test_a_background_that_moves_changes_no_bit_inside_masks(tmp_path: Path) -> None:
@@ -68,6 +71,36 @@ def test_a_photo_that_does_not_show_the_object_carves_nothing_and_is_named(tmp_p
     assert (found.name, found.kind, found.repair) == (f"train/r_{CUT}.png", "empty", "cleared")
     assert not bool(scene.train[CUT].pixels()[..., 3].any()), "it still shows nothing"
     torch.testing.assert_close(hull_extent(scene), hull_extent(whole), rtol=0.12, atol=0)
+
+
+def test_two_objects_that_all_masks_show_are_both_kept(tmp_path: Path) -> None:
+    scene, repaired = load_with_agreeing_masks(photos(tmp_path, COUNT, balls=APART))
+    assert repaired == []
+    means = first_gaussians(scene, InitConfig(method="hull", count=2000), 0, 0)[0].means
+    for ball in APART:
+        assert int(((means - torch.tensor(ball.center)).norm(dim=1) < 1.3 * ball.radius).sum()) > 500
+
+
+def test_a_mask_that_shows_one_of_two_objects_is_named_and_costs_neither(tmp_path: Path) -> None:
+    config = photos(tmp_path, COUNT, balls=APART)
+    one = picture(ring(COUNT)[CUT], APART[:1])[..., 3].astype(np.uint8)
+    Image.fromarray(one).save(tmp_path / "masks" / "train" / f"r_{CUT}.png")
+    scene, (found,) = load_with_agreeing_masks(config)
+    assert (found.name, found.kind) == (f"train/r_{CUT}.png", "lost")
+    both = torch.from_numpy(picture(ring(COUNT)[CUT], APART)[..., 3].copy()) > 127
+    kept = scene.train[CUT].pixels()[..., 3] > 127
+    assert float((both & kept).sum()) > 0.9 * float(both.sum())
+
+
+def test_masks_of_another_size_and_the_same_aspect_are_scaled(tmp_path: Path) -> None:
+    whole = load_scene(photos(tmp_path / "whole", COUNT))
+    config = photos(tmp_path / "half", COUNT)
+    for path in (tmp_path / "half" / "masks" / "train").iterdir():
+        Image.open(path).resize((SIZE // 2, SIZE // 2), Image.Resampling.BOX).save(path)
+    scene, repaired = load_with_agreeing_masks(config)
+    assert repaired == []
+    assert scene.train[0].pixels().shape == (SIZE, SIZE, 4)
+    torch.testing.assert_close(hull_extent(scene), hull_extent(whole), rtol=0.06, atol=0)
 
 
 def shifted(root: Path, by: list[int]) -> None:

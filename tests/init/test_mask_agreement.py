@@ -47,11 +47,11 @@ BREAKS = {"empty": empty, "full": full, "plinth": plinth, "half": half}
 KINDS = {"empty": "empty", "full": "too large", "plinth": "too large", "half": "lost"}
 
 
-def photos(root: Path, count: int, broken: str = "") -> DataConfig:
+def photos(root: Path, count: int, broken: str = "", balls: list[Ball] = BALLS) -> DataConfig:
     """Opaque photos of brown balls before green, with masks of which one may be broken."""
-    write_balls(root, BALLS, ring(count))
+    write_balls(root, balls, ring(count))
     for index in range(count):
-        drawn = picture(ring(count)[index], BALLS).astype(float)
+        drawn = picture(ring(count)[index], balls).astype(float)
         noise = np.random.default_rng(index).integers(0, 40, (SIZE, SIZE, 3))
         alpha = drawn[..., 3:] / 255
         colors = alpha * drawn[..., :3] + (1 - alpha) * (np.array([20, 150, 60]) + noise)
