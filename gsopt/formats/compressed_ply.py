@@ -22,7 +22,7 @@ from gsopt.errors import InputError
 from gsopt.formats.files import opened, replacing
 from gsopt.formats.ply import read_splats
 from gsopt.formats.ply_header import Element, Header, read_header
-from gsopt.formats.ply_rows import float_blocks, raw_blocks, seek_element
+from gsopt.formats.ply_rows import BLOCK, float_blocks, raw_blocks, seek_element
 from gsopt.formats.units import UNKNOWN, Units
 from gsopt.formats.validation import BYTE_OPACITY_MARGIN, logit, opacity_bytes, storable
 from gsopt.gaussians import Gaussians
@@ -221,19 +221,25 @@ def _wrong(chunk: Element | None, vertex: Element | None, bands: Element | None)
 
 
 def _unpack(extremes: NDArray[np.float64], packed: NDArray[np.uint32], shN: NDArray[np.float32]) -> Gaussians:
-    color = _split(packed[:, 3], _BITS_4)
-    parts = (_split(packed[:, 0], _BITS_3), _split(packed[:, 2], _BITS_3), color[:, :3])
-    chunk = np.arange(len(packed)) // CHUNK
-    with np.errstate(over="ignore", invalid="ignore"):  # the caller drops what is not finite
-        means, log_scales, rgb = (
-            torch.from_numpy((low[chunk] * (1 - part) + high[chunk] * part).astype(np.float32))
-            for part, low, high in zip(parts, *(np.split(extremes, 6, axis=1)[i::2] for i in (0, 1)), strict=True)
-        )
+    n = len(packed)
+    means, log_scales, rgb = (np.empty((n, 3), np.float32) for _ in range(3))
+    quats, logits = np.empty((n, 4), np.float32), torch.empty(n)
+    for start in range(0, n, BLOCK):
+        rows = slice(start, min(start + BLOCK, n))
+        words = packed[rows]
+        color = _split(words[:, 3], _BITS_4)
+        parts = (_split(words[:, 0], _BITS_3), _split(words[:, 2], _BITS_3), color[:, :3])
+        ends = np.split(extremes[np.arange(rows.start, rows.stop) // CHUNK], 6, axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):  # the caller drops what is not finite
+            for out, part, low, high in zip((means, log_scales, rgb), parts, ends[::2], ends[1::2], strict=True):
+                out[rows] = low * (1 - part) + high * part
+        quats[rows] = _unpack_smallest_three(words[:, 1])
+        logits[rows] = logit(torch.from_numpy(color[:, 3]), BYTE_OPACITY_MARGIN)
     return Gaussians(
-        means=means,
-        quats=torch.from_numpy(_unpack_smallest_three(packed[:, 1]).astype(np.float32)),
-        log_scales=log_scales,
-        logit_opacities=logit(torch.from_numpy(color[:, 3]), BYTE_OPACITY_MARGIN),
-        sh0=sh.sh0_from_rgb(rgb)[:, None],
+        means=torch.from_numpy(means),
+        quats=torch.from_numpy(quats),
+        log_scales=torch.from_numpy(log_scales),
+        logit_opacities=logits,
+        sh0=sh.sh0_from_rgb(torch.from_numpy(rgb))[:, None],
         shN=torch.from_numpy(shN),
     )

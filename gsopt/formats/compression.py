@@ -17,34 +17,53 @@ _ALWAYS_ALLOWED = 1 << 23
 """Bytes that any file may decode to (8 MiB, 150,000 splats without view-dependent color)."""
 _MAX_RATIO = 50
 """Beyond 8 MiB, a file may decode to this many times its size; runs reach 15, a grid of equal splats 40."""
+_UNCHECKED_RATIO = 8
+"""A stream that unpacks to more than this many times the file is read to its end before a byte is kept."""
 
 
-def check_budget(decoded: int, packed: int, path: Path) -> None:
-    """InputError when `decoded` bytes of float32 parameters out of a file of `packed` bytes are implausible."""
-    if decoded > max(_ALWAYS_ALLOWED, _MAX_RATIO * packed):
+def check_budget(decoded: int, packed: int, path: Path, ratio: int = _MAX_RATIO) -> None:
+    """InputError when `decoded` bytes of parameters or pixels out of a file of `packed` bytes are implausible."""
+    if decoded > max(_ALWAYS_ALLOWED, ratio * packed):
         raise InputError(
-            f"{path} claims to decode from {packed} to {decoded} bytes, {_MAX_RATIO} times its size is the limit. "
+            f"{path} claims to decode from {packed} to {decoded} bytes, {ratio} times its size is the limit. "
             "It is damaged or hostile: export it again."
         )
 
 
+def needs_check(plain: int, packed: int) -> bool:
+    """True when to unpack `packed` bytes to `plain` ones costs too much for a file that may turn out damaged."""
+    return plain > max(_ALWAYS_ALLOWED // 2, _UNCHECKED_RATIO * packed)
+
+
 class GzipStream:
-    """A gzip stream, decompressed piece by piece."""
+    """A gzip stream from the file's start, decompressed piece by piece."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
+        file.seek(0)
         self._file, self._path = file, path
         self._zlib = zlib.decompressobj(_GZIP_WINDOW)
         self._pending = b""
 
-    def take(self, count: int) -> bytes:
+    def take(self, count: int) -> bytearray:
         """Exactly `count` unpacked bytes, or InputError where the stream is damaged or ends before."""
-        out = bytearray()
-        while len(out) < count:
+        out, done = bytearray(count), 0
+        for piece in self._pieces(count):
+            out[done : done + len(piece)] = piece
+            done += len(piece)
+        return out
+
+    def skip(self, count: int) -> None:
+        """As `take`, without keeping them."""
+        for _ in self._pieces(count):
+            pass
+
+    def _pieces(self, count: int) -> Iterator[bytes]:
+        while count:
             if self._zlib.eof:
-                missing = count - len(out)
-                raise InputError(f"{self._path} ends {missing} bytes before its last splat. Copy or export it again.")
-            out += self._step(count - len(out))
-        return bytes(out)
+                raise InputError(f"{self._path} ends {count} bytes before its last splat. Copy or export it again.")
+            piece = self._step(min(count, _PIECE))
+            count -= len(piece)
+            yield piece
 
     def rest(self, limit: int) -> bytes:
         """All unpacked bytes up to the end; InputError beyond `limit`."""
@@ -85,20 +104,29 @@ def deflated(parts: Iterable[bytes]) -> Iterator[bytes]:
     yield packer.flush()
 
 
-def unzstd(file: BinaryIO, sizes: tuple[int, int], count: int, file_size: int, path: Path) -> bytes:
-    """The next Zstandard stream: `sizes` = (packed, plain) as claimed, `count` the plain size it must have."""
+def unzstd(
+    file: BinaryIO, sizes: tuple[int, int], count: int, file_size: int, path: Path, *, keep: bool = True
+) -> bytearray:
+    """The next Zstandard stream: `sizes` = (packed, plain) as claimed, `count` the plain size it must have.
+
+    Without `keep` it is only checked, and nothing is returned.
+    """
     packed, plain = sizes
     if plain != count or packed > file_size:
         raise InputError(f"{path} claims a stream of {packed} to {plain} bytes, {count} needed. Export it again.")
     zstandard = require("zstandard", "spz", "Reading .spz version 4")
     data = read_exactly(file, packed, path, "a stream")
+    out, done = bytearray(count if keep else 0), 0
     try:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as reader:
-            out = bytes(reader.read(count + 1))
+            while piece := reader.read(min(_PIECE, count + 1 - done)):
+                if keep:
+                    out[done : done + len(piece)] = piece
+                done += len(piece)
     except zstandard.ZstdError as error:
         raise InputError(f"{path} is damaged: {error}. Copy or export it again.") from error
-    if len(out) != count:
-        raise InputError(f"{path}: a stream must unpack to {count} bytes, got {len(out)}. Copy or export it again.")
+    if done != count:
+        raise InputError(f"{path}: a stream must unpack to {count} bytes, got {done}. Copy or export it again.")
     return out
 
 

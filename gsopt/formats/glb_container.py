@@ -20,7 +20,10 @@ JSON, BINARY = b"JSON", b"BIN\0"
 HEADER = struct.Struct("<4sII")
 CHUNK = struct.Struct("<I4s")
 _MAX_JSON = 1 << 20
+_ALWAYS_ALLOWED_JSON = 1 << 17
 """Bytes. A file of splats alone has about 10 kB. Parsed JSON takes up to 25 times its text."""
+_JSON_SHARE = 0.3
+"""Beyond the 128 kB that are always allowed, the JSON is at most this share of a file."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +86,9 @@ def read_container(file: BinaryIO, file_size: int, path: Path) -> Document:
     if total > file_size:
         raise InputError(f"{path} claims {total} bytes, got {file_size}. It was cut short: copy or export it again.")
     text = _chunk(file, file_size, path, JSON)
-    if text > _MAX_JSON:
-        raise InputError(f"{path}: the JSON may have {_MAX_JSON} bytes, got {text}. Export the splats on their own.")
+    limit = min(_MAX_JSON, max(_ALWAYS_ALLOWED_JSON, int(_JSON_SHARE * file_size)))
+    if text > limit:
+        raise InputError(f"{path}: the JSON may have {limit} bytes, got {text}. Export the splats on their own.")
     root = _parse(read_exactly(file, text, path, "its JSON"), path)
     length = _chunk(file, file_size, path, BINARY)
     return Document(root, file.tell(), length, path)

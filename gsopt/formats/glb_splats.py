@@ -49,7 +49,8 @@ class Accessor:
         shape, strides = (self.count, self.components), (self.stride, self.kind.itemsize)
         values = np.ndarray(shape, self.kind, data, 0, strides).astype(np.float32)
         if self.normalized and self.kind.kind != "f":
-            values = np.maximum(values / np.float32(np.iinfo(self.kind).max), np.float32(-1))
+            values /= np.float32(np.iinfo(self.kind).max)
+            np.maximum(values, np.float32(-1), out=values)
         return values
 
 

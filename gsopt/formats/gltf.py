@@ -139,29 +139,33 @@ def _read_primitive(file: BinaryIO, primitive: Primitive, document: Document) ->
 
 def _read(file: BinaryIO, primitive: dict[str, Accessor], document: Document) -> Gaussians:
     count = primitive["POSITION"].count if "POSITION" in primitive else 0
-
-    def values(name: str, components: int) -> Tensor:
+    degrees = [d for d in range(MAX_SH_DEGREE + 1) if any(f":SH_DEGREE_{d}_" in name for name in primitive)]
+    base, *bands = (
+        f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(max(degrees, default=0) + 1) for i in range(2 * d + 1)
+    )
+    widths = {"POSITION": 3, f"{EXTENSION}:ROTATION": 4, f"{EXTENSION}:SCALE": 3, f"{EXTENSION}:OPACITY": 1}
+    for name, components in (widths | dict.fromkeys([base, *bands], 3)).items():
         accessor = primitive.get(name)
         if accessor is None or (accessor.count, accessor.components) != (count, components):
             got = "nothing" if accessor is None else f"{accessor.count} times {accessor.components}"
             document.fail(f"{name} must have {count} times {components} values, got {got}")
-        return torch.from_numpy(accessor.read(file, document))
 
-    def coefficients(degree: int) -> list[Tensor]:
-        return [values(f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}", 3) for i in range(2 * degree + 1)]
+    def values(name: str) -> Tensor:
+        return torch.from_numpy(primitive[name].read(file, document))
 
-    scale, opacity = values(f"{EXTENSION}:SCALE", 3), values(f"{EXTENSION}:OPACITY", 1)[:, 0]
+    scale, opacity = values(f"{EXTENSION}:SCALE"), values(f"{EXTENSION}:OPACITY")[:, 0]
     if bool((scale < 0).any()):
         document.fail("a scale is negative: the file follows an early draft of the extension, with logarithms")
     if bool(((opacity < 0) | (opacity > 1)).any()):
         document.fail("opacities must lie in [0, 1]")
-    degrees = [d for d in range(1, MAX_SH_DEGREE + 1) if any(f":SH_DEGREE_{d}_" in name for name in primitive)]
-    bands = [band for degree in range(1, max(degrees, default=0) + 1) for band in coefficients(degree)]
+    shN = torch.empty(count, len(bands), 3)
+    for i, name in enumerate(bands):
+        shN[:, i] = values(name)
     return Gaussians(
-        means=values("POSITION", 3),
-        quats=values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        means=values("POSITION"),
+        quats=values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
         log_scales=log_scales(scale),
         logit_opacities=logit(opacity, _OPACITY_MARGIN),
-        sh0=torch.stack(coefficients(0), dim=1),
-        shN=torch.stack(bands, dim=1) if bands else torch.empty(count, 0, 3),
+        sh0=values(base)[:, None],
+        shN=shN,
     )

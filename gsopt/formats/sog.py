@@ -11,7 +11,7 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -32,6 +32,14 @@ from gsopt.geometry.morton import morton_order
 META = "meta.json"
 _MAX_META = 1 << 17
 """Bytes; a meta.json has about 12 kB. Parsed JSON takes up to 25 times its text."""
+_PIXEL_COST = 24
+"""Bytes that Pillow takes per pixel while it decodes a WebP."""
+_IMAGE_RATIO, _PALETTE_RATIO = 10, _PIXEL_COST
+"""Times the file's size that this may be; trained palettes take fewer bytes than pixels in some files of peers."""
+_UNCHECKED_SHARE = 0.1
+"""Splats per byte of a file; images of more are all decoded once before any is kept."""
+_MAX_LOG_MEAN = 88.0
+"""Extremes of positions; exp(88) is near the end of float32."""
 _SPARE_PIXELS = 1 << 14
 """Pixels that an image may have beyond twice the number of splats; encoders fill their last row."""
 _MAX_SPLATS = 1 << 28
@@ -40,6 +48,8 @@ _ROW_PIXELS = 64
 """Palette entries in one row of the image of centroids."""
 _TIME = (1980, 1, 1, 0, 0, 0)
 """Time stamp of every member, so that equal splats give equal bytes."""
+_IMAGES = (("means", 0, 3), ("means", 1, 3), ("quats", 0, 4), ("scales", 0, 3), ("sh0", 0, 4))
+"""Section, number and channels of every image with a pixel per splat, but that of the palette's labels."""
 Pixels = NDArray[np.uint8]
 
 
@@ -71,7 +81,11 @@ def _webp(image: Pixels) -> bytes:
 
 
 def load_sog(path: Path) -> Gaussians:
-    """Read a .sog of version 2. Images and members are bounded by the size of the file before they are decoded."""
+    """Read a .sog of version 2.
+
+    Images and members are bounded by the size of the file before they are decoded, and no value is looked up before
+    every image was.
+    """
     with opened(path) as (file, size), _archive(file, path) as archive:
         bundle = _Bundle(archive, _meta(archive, path), size, path)
         return bundle.gaussians()
@@ -121,6 +135,11 @@ def _meta(archive: zipfile.ZipFile, path: Path) -> Mapping[str, Any]:
     return meta
 
 
+def _rows(labels: Pixels) -> NDArray[np.integer]:
+    """Numbers of palette entries from their low and high bytes."""
+    return labels[:, 0] | labels[:, 1].astype(np.uint16) << 8
+
+
 class _Bundle:
     """An opened .sog whose meta.json was read; every access checks the type it finds."""
 
@@ -132,32 +151,46 @@ class _Bundle:
         harmonics = self._meta.get("shN")
         bands = BANDS[self._integer(self._section("shN"), "bands", 3)] if harmonics else 0
         check_budget(4 * self._count * (14 + 3 * bands), self._size, self._path)
-        means = self._section("means")
-        low, high = (self._images("means", i)[:, :3] for i in (0, 1))
-        rgba = self._images("sh0", 0)
+        mins, maxs = (self._floats(self._section("means"), key, 3) for key in ("mins", "maxs"))
+        if max(np.abs(mins).max(), np.abs(maxs).max()) > _MAX_LOG_MEAN:
+            self._fail(f"`mins` and `maxs` must lie within {_MAX_LOG_MEAN:g}, got {mins} and {maxs}")
+        scales, colors = self._codebook("scales"), self._codebook("sh0")
+        harmonics = self._codebook("shN") if bands else None
+        if self._count > _UNCHECKED_SHARE * self._size:
+            for _ in self._attributes(bands):
+                pass  # a damaged image is found while only one is in memory
+        low, high, quats, scale_codes, rgba, *palette = self._attributes(bands)
         return codes.decode(
-            means=codes.unpack_means(low, high, self._floats(means, "mins", 3), self._floats(means, "maxs", 3)),
-            quats=self._images("quats", 0),
-            log_scales=self._codebook("scales")[self._images("scales", 0)[:, :3]],
-            sh0=self._codebook("sh0")[rgba[:, :3]],
+            means=codes.unpack_means(low, high, mins, maxs),
+            quats=quats,
+            log_scales=scales[scale_codes],
+            sh0=colors[rgba[:, :3]],
             opacities=rgba[:, 3],
-            shN=self._harmonics(bands) if bands else np.zeros((self._count, 0, 3), np.float32),
+            shN=np.zeros((self._count, 0, 3), np.float32)
+            if harmonics is None
+            else harmonics[palette[0]][_rows(palette[1])],
         )
 
-    def _harmonics(self, bands: int) -> NDArray[np.float32]:
-        section = self._section("shN")
-        entries = self._integer(section, "count", 1 << 16)
-        labels = self._images("shN", 1)
-        rows = labels[:, 0].astype(np.int64) | labels[:, 1].astype(np.int64) << 8
-        if int(rows.max()) >= entries:
-            self._fail(f"palette entry {rows.max()} of {entries} is used")
-        image = self._image(self._file(section, 0), (_ROW_PIXELS * bands, -(-entries // _ROW_PIXELS)))
-        palette = image[..., :3].reshape(-1, bands, 3)[:entries]
-        return self._codebook("shN")[palette][rows]
+    def _attributes(self, bands: int) -> Iterator[Pixels]:
+        """Pixels [count, 3 or 4] of low and high bytes of positions, rotations, scales and colors; where there are
+        bands the palette [entries, bands, 3] and its labels [count, 2]."""
+        for key, index, channels in _IMAGES:
+            yield self._splat_image(key, index, channels)
+        if bands:
+            section = self._section("shN")
+            entries = self._integer(section, "count", 1 << 16)
+            image = self._image(self._file(section, 0), (_ROW_PIXELS * bands, -(-entries // _ROW_PIXELS)))
+            yield np.ascontiguousarray(image[..., :3].reshape(-1, bands, 3)[:entries])
+            labels = self._splat_image("shN", 1, 2)
+            greatest = int(_rows(labels).max())
+            if greatest >= entries:
+                self._fail(f"palette entry {greatest} of {entries} is used")
+            yield labels
 
-    def _images(self, key: str, index: int) -> Pixels:
-        """[count, 4] pixels of one image."""
-        return self._image(self._file(self._section(key), index), None).reshape(-1, 4)[: self._count]
+    def _splat_image(self, key: str, index: int, channels: int) -> Pixels:
+        """[count, channels] pixels of an image with one per splat."""
+        image = self._image(self._file(self._section(key), index), None)
+        return np.ascontiguousarray(image.reshape(-1, 4)[: self._count, :channels])
 
     def _image(self, name: str, size: tuple[int, int] | None) -> Pixels:
         """[H, W, 4] pixels: of that (width, height), or at least one pixel per splat."""
@@ -168,8 +201,10 @@ class _Bundle:
                 fits = self._count <= width * height <= 2 * self._count + _SPARE_PIXELS
                 if (width, height) != size if size else not fits:
                     self._fail(f"{shortened(name)} has {width} x {height} pixels for {self._count} splats")
-                check_budget(4 * width * height, self._size, self._path)
-                return np.asarray(image.convert("RGBA"))
+                ratio = _PALETTE_RATIO if size else _IMAGE_RATIO
+                check_budget(_PIXEL_COST * width * height, self._size, self._path, ratio)
+                image.load()
+                return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise InputError(f"{self._path}: {shortened(name)} is no image: {error}. Export it again.") from error
 

@@ -19,7 +19,7 @@ import torch
 
 from gsopt.errors import InputError, InputWarning
 from gsopt.formats.axes import RIGHT_UP_BACK, with_flipped_axes
-from gsopt.formats.compression import GzipStream, check_budget, deflated, unzstd, zstandard_compressed
+from gsopt.formats.compression import GzipStream, check_budget, deflated, needs_check, unzstd, zstandard_compressed
 from gsopt.formats.files import opened, read_exactly, replacing
 from gsopt.formats.placement import placed
 from gsopt.formats.spz_codes import pack, stream_sizes, unpack
@@ -91,16 +91,17 @@ def load_spz(path: Path) -> Gaussians:
     """Read a .spz of version 2, 3 or (with the package `zstandard`) 4.
 
     Band 4 of the harmonics is left out with a warning. A file that would decode to far more than its own size is
-    refused before it is unpacked.
+    refused before it is unpacked. One that unpacks to much more is first read to its end, where a checksum tells
+    whether it is damaged, without keeping what was unpacked.
     """
     with opened(path) as (file, size):
         read = _read_gzip if _is_gzip(file, path) else _read_zstandard
         header, streams, extensions = read(file, size, path)
+    frame = frame_of(extensions, path)
     gaussians = unpack(streams, header.count, header.sh_degree, header.version, header.fraction_bits)
     if header.sh_degree > MAX_SH_DEGREE:
         warnings.warn(f"{path}: band 4 of its harmonics was left out, 3 are drawn.", InputWarning, stacklevel=4)
         gaussians = gaussians.with_sh_degree(MAX_SH_DEGREE)
-    frame = frame_of(extensions, path)
     if frame == OWN_FRAME:
         return with_flipped_axes(gaussians, RIGHT_UP_BACK)
     return placed(gaussians, 1.0, ply_from_frame(frame), torch.zeros(3))
@@ -110,7 +111,7 @@ def spz_antialiased(path: Path) -> bool:
     """True when the file records that its splats were optimized with the 2D filter of Mip-Splatting."""
     with opened(path) as (file, _):
         if _is_gzip(file, path):
-            data = GzipStream(file, path).take(_HEADER.size)
+            data: bytes | bytearray = GzipStream(file, path).take(_HEADER.size)
         else:
             data = read_exactly(file, _HEADER.size, path, "its header")
         return bool(_parse(data, path, (2, 3, 4)).flags & _ANTIALIASED)
@@ -125,17 +126,27 @@ def _is_gzip(file: BinaryIO, path: Path) -> bool:
     return start[:2] == _GZIP
 
 
-def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes], bytes]:
+def _read_gzip(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytearray], bytes]:
     stream = GzipStream(file, path)
     header = _parse(stream.take(_HEADER.size), path, (2, 3))
     check_budget(header.decoded, size, path)
+    if needs_check(sum(header.sizes), size):
+        stream.skip(sum(header.sizes))
+        _finish(stream, header)
+        stream = GzipStream(file, path)
+        stream.skip(_HEADER.size)
     streams = [stream.take(count) for count in header.sizes]
+    return header, streams, _finish(stream, header)
+
+
+def _finish(stream: GzipStream, header: _Header) -> bytes:
+    """The extensions, which follow the last attribute, having compared the checksum."""
     extensions = stream.rest(_MAX_EXTENSIONS) if header.flags & _HAS_EXTENSIONS else b""
     stream.finish()
-    return header, streams, extensions
+    return extensions
 
 
-def _read_zstandard(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytes], bytes]:
+def _read_zstandard(file: BinaryIO, size: int, path: Path) -> tuple[_Header, list[bytearray], bytes]:
     header = _parse(read_exactly(file, _HEADER.size, path, "its header"), path, (4,))
     (table,) = _TABLE_OFFSET.unpack(read_exactly(file, _TABLE_OFFSET.size, path, "its header"))
     check_budget(header.decoded, size, path)
@@ -146,12 +157,17 @@ def _read_zstandard(file: BinaryIO, size: int, path: Path) -> tuple[_Header, lis
         raise InputError(f"{path} must have {want}, got {header.streams} and {table}. Export it again.")
     records = read_exactly(file, table - begin, path, "its extensions")
     entries = [_SIZES.unpack(read_exactly(file, _SIZES.size, path, "its table")) for _ in expected]
+    begin = file.tell()
+    if needs_check(sum(expected), size):
+        for entry, count in zip(entries, expected, strict=True):
+            unzstd(file, entry, count, size, path, keep=False)
+        file.seek(begin)
     streams = [unzstd(file, entry, count, size, path) for entry, count in zip(entries, expected, strict=True)]
     extensions = records if header.flags & _HAS_EXTENSIONS else b""
-    return header, streams + [b""] * (len(header.sizes) - len(streams)), extensions
+    return header, streams + [bytearray()] * (len(header.sizes) - len(streams)), extensions
 
 
-def _parse(data: bytes, path: Path, versions: tuple[int, ...]) -> _Header:
+def _parse(data: bytes | bytearray, path: Path, versions: tuple[int, ...]) -> _Header:
     magic, version, count, degree, fraction_bits, flags, last = _HEADER.unpack(data)
     if magic != _MAGIC:
         raise InputError(f"{path} must hold the mark `NGSP`, got {magic!r}. It is no .spz: check the path.")

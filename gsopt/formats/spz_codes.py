@@ -49,7 +49,7 @@ def pack(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
     return fraction_bits, [np.asarray(stream).tobytes() for stream in streams]
 
 
-def unpack(streams: Sequence[bytes], count: int, sh_degree: int, version: int, fraction_bits: int) -> Gaussians:
+def unpack(streams: Sequence[bytearray], count: int, sh_degree: int, version: int, fraction_bits: int) -> Gaussians:
     """Gaussians, still right, up, back, from six streams of the sizes that `stream_sizes` names."""
     positions, alphas, colors, scales, rotations, bands = (np.frombuffer(stream, np.uint8) for stream in streams)
     unpack_quats = _unpack_first_three if version == 2 else _unpack_smallest_three

@@ -88,9 +88,10 @@ def turned(shN: Float[Tensor, "N K-1 3"], axes: Float[Tensor, "3 3"]) -> Float[T
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
     before, after = basis(directions, degree), basis(directions @ axes.double().T, degree)
-    out = [shN[:, :0]]
+    out = torch.empty_like(shN)
     for band in range(1, degree + 1):
         rows = slice(band * band, (band + 1) ** 2)
         matrix = torch.linalg.lstsq(after[:, rows], before[:, rows]).solution
-        out.append(torch.einsum("ij,njc->nic", matrix.to(shN), shN[:, rows.start - 1 : rows.stop - 1]))
-    return torch.cat(out, dim=1)
+        stored = slice(rows.start - 1, rows.stop - 1)
+        out[:, stored] = torch.einsum("ij,njc->nic", matrix.to(shN), shN[:, stored])
+    return out
