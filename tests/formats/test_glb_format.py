@@ -191,7 +191,7 @@ LIES = {
     "compressed": (set_in(*SPLATTING, "extensions", value={"X_spz": {}}), "compressed"),
     "an unknown extension": (set_in("extensionsRequired", value=["X_y"]), "X_y"),
     "no splats": (set_in(*PRIMITIVE, "extensions", value={}), "holds no splats"),
-    "missing positions": (set_in(*PRIMITIVE, "attributes", value={}), "SCALE must have"),
+    "missing positions": (set_in(*PRIMITIVE, "attributes", value={}), "POSITION must have"),
     "half a degree": (
         lambda root: root["meshes"][0]["primitives"][0]["attributes"].pop(f"{EXTENSION}:SH_DEGREE_1_COEF_1"),
         "COEF_1 must have",

@@ -116,7 +116,7 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "extremes of another type": (lambda m: m["means"].update(mins=["a", 1, 2]), "3 finite"),
     "degree 4": (lambda m: m["shN"].update(bands=4), "`bands`"),
     "another degree": (lambda m: m["shN"].update(bands=2), "pixels for"),
-    "a small palette": (lambda m: m["shN"].update(count=1), "palette entry"),
+    "a small palette": (lambda m: m["shN"].update(count=65), "palette entry"),
 }
 
 
