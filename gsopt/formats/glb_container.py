@@ -20,10 +20,10 @@ JSON, BINARY = b"JSON", b"BIN\0"
 HEADER = struct.Struct("<4sII")
 CHUNK = struct.Struct("<I4s")
 _MAX_JSON = 1 << 20
-_ALWAYS_ALLOWED_JSON = 1 << 17
+_ALWAYS_ALLOWED_JSON = 300 << 10
 """Bytes. A file of splats alone has about 10 kB. Parsed JSON takes up to 25 times its text."""
 _JSON_SHARE = 0.3
-"""Beyond the 128 kB that are always allowed, the JSON is at most this share of a file."""
+"""Beyond the 300 kB that are always allowed, the JSON is at most this share of a file."""
 
 
 @dataclass(frozen=True)
