@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from balls import picture, ring
+from balls import Ball, picture, ring, write_balls
 from PIL import Image
 from test_mask_agreement import BALLS, SIZE, photos
 
@@ -144,6 +144,17 @@ def test_right_masks_say_where_other_photos_show_the_object(tmp_path: Path) -> N
         left, top, right, bottom = box_of_points(photo.camera, points) or (0, 0, 0, 0)
         assert not bool(solid[:top].any() or solid[bottom:].any() or solid[:, :left].any() or solid[:, right:].any())
         assert (right - left) * (bottom - top) < 0.7 * SIZE**2
+
+
+def test_silhouettes_that_share_nothing_hold_no_point(tmp_path: Path) -> None:
+    """Of a ball on the left and a ball on the right, seen from the same places."""
+    cameras = ring(4, size=SIZE)
+    sides = [write_balls(tmp_path / f"{x}", [Ball((x, x, x), 0.1)], cameras) for x in (-0.5, 0.5)]
+    left, right = (small_photos(load_scene(DataConfig(path=str(root))).train, 4) for root in sides)
+    shown = [*left[:2], *right[2:]]
+    points = object_points(shown, find_focus([photo.camera for photo in shown], 1.0))
+    assert points.shape == (0, 3)
+    assert box_of_points(shown[0].camera, points) is None
 
 
 def test_boxes_have_a_margin_and_stay_in_the_image() -> None:

@@ -159,3 +159,17 @@ def test_a_mask_of_one_value_has_no_parts_to_drop(value: bool) -> None:
     mask = torch.full((5, 7), value)
     assert torch.equal(cleaned(mask), mask)
     assert int(labels(mask).max()) == int(value)
+
+
+def test_a_ray_is_as_thick_as_its_way_through_the_hull(tmp_path: Path) -> None:
+    """The hull of a ball from many sides: the chord of each pixel's ray, over the mean of the chords."""
+    root = write_balls(tmp_path, [Ball((0.0, 0, 0), 0.6)], ring(10, size=SIZE))
+    found = agreement(load_scene(DataConfig(path=str(root))))
+    thick = found.thickness(0)
+    camera = found.photos[0].camera
+    row, column = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    offset = torch.hypot(row + 0.5 - camera.height / 2, column + 0.5 - camera.width / 2) / float(camera.Ks[0, 0, 0])
+    chord = 2 * (0.6**2 - (4.0 * offset) ** 2).clamp_min(0).sqrt()
+    expected = chord / chord[chord > 0].mean()
+    assert float((thick - expected).abs()[chord > 0].mean()) < 0.3  # a hull of nine views, by a pixel's reach wider
+    assert float(thick[offset > 0.8 / 4].abs().max()) == 0

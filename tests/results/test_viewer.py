@@ -354,3 +354,24 @@ def test_a_held_out_view_stands_beside_its_render_and_error(recorder: Recorder, 
     assert np.abs(truth.astype(int) - render).mean() < 6
     assert error.mean() < np.split(nothing, 3, axis=1)[2].mean()
     assert viewer_controls.held_out_views(recorder.server, (), config, made) is None
+
+
+def test_splats_without_cameras_are_seen_from_aside_and_above(recorder: Recorder) -> None:
+    """From (2, 2, 1) radii off the center: three radii away, so that all of them are in the picture."""
+    model = gaussians(200)
+    model.means[:] += torch.tensor([5.0, -3.0, 2.0])
+    shown = viewer.SplatViewer("127.0.0.1", 0)
+    viewer.frame_run(shown, model, None)
+    center, radius = viewer.center_and_radius(model.means)
+    camera = recorder.server.initial_camera
+    torch.testing.assert_close(torch.tensor(camera.position).float(), center + radius * torch.tensor([2.0, 2.0, 1.0]))
+    torch.testing.assert_close(torch.tensor(camera.look_at).float(), center)
+
+
+def test_a_held_out_view_is_rendered_again_with_each_preview(recorder: Recorder, tmp_path: Path) -> None:
+    made = make_run(tmp_path, test=2)
+    emit(made, {"kind": "done", "step": 100})
+    image = recorder.server.gui.add_image.return_value
+    image.image = None
+    assert next(viewer.view_run(viewer.SplatViewer("127.0.0.1", 0), made)) == "done"
+    assert isinstance(image.image, np.ndarray)

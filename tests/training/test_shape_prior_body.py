@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from balls import Ball, ring, write_balls
+from PIL import Image
 from tiny_scenes import tiny_config
 
 from gsopt.config.guidance import GuidanceConfig, completes_bodies, shape_prior_of
@@ -70,6 +71,11 @@ def test_the_body_is_what_the_run_learns_from_and_stands_in_its_record(result: T
     assert (record["prior"], record["words"], record["photos"]) == ("small", ["ball"], 1)
     assert "zoo" in record["unknown_words"]
     assert "small" in str(events_of(result.run, "shape_prior")[0]["message"])
+    pictures = sorted((result.run / "shape_prior").glob("side_*.png"))
+    assert [path.name for path in pictures] == [f"side_{i:02d}.png" for i in range(4)]
+    for path in pictures:
+        with Image.open(path) as picture:
+            assert picture.getpixel((0, 0)) == (255, 255, 255)
     assert "body of a shape prior" in str(events_of(result.run, "started")[0]["init"])
 
 

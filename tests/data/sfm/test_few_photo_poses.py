@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
 
 import pycolmap
 
-from gsopt.data.sfm import diagnosis
+from gsopt.data.sfm import diagnosis, few_photos
 from gsopt.data.sfm.guided_matches import fundamental_matrix, guided
 from gsopt.data.sfm.pair_matches import PairMatches, without_background
 
@@ -96,3 +98,25 @@ def test_a_blurred_photo_is_named_also_where_it_was_placed() -> None:
     assert [text for text in advice if "blurred" in text] == [
         "2.jpg is placed but blurred: the splats learn its blur. Take it again, or leave it out."
     ]
+
+
+@pytest.mark.parametrize("size", [(400, 300), (300, 400)])
+def test_a_focal_length_that_is_tried_is_a_multiple_of_the_longer_side_without_distortion(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    database = tmp_path / "photos.db"
+    project = SimpleNamespace(pycolmap=pycolmap)
+    with pycolmap.Database.open(database) as db:
+        known = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", 123.0, *size)
+        known.has_prior_focal_length = True
+        unknown = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", 50.0, *size)
+        unknown.params = [50.0, 1.0, 2.0, 0.3]
+        numbers = [db.write_camera(known), db.write_camera(unknown)]
+        lenses = few_photos._lenses(project, db, None, 1.2)
+        for lens in (lenses[numbers[1]], db.read_camera(numbers[1])):
+            assert list(lens.params) == [1.2 * 400, size[0] / 2, size[1] / 2, 0.0]
+            assert lens.has_prior_focal_length
+        model = SimpleNamespace(cameras={numbers[1]: known})
+        assert few_photos._lenses(project, db, model, 1.2)[numbers[1]] is known
+        before = few_photos._lenses(project, db, None, None)
+        assert before[numbers[1]].params[0] == 480.0

@@ -151,3 +151,20 @@ def test_a_photo_of_50_megapixels_is_read(tmp_path: Path) -> None:
     found, refused = photos.read_photos(photos.find_photos(tmp_path / "photos"), tmp_path / "work")
     assert refused == []
     assert (found[0].width, found[0].height) == (8688, 5792)
+
+
+@pytest.mark.parametrize("white", [1, 2, 200, 255])
+def test_masks_of_a_folder_keep_their_grays_and_masks_of_0_and_1_become_white(
+    folder: Path, tmp_path: Path, white: int
+) -> None:
+    read, _ = read_photos(find_photos(folder), tmp_path)
+    given = np.zeros((read[0].height, read[0].width), np.uint8)
+    given[: read[0].height // 2] = white
+    for photo in read:
+        Image.fromarray(given).save(tmp_path / f"{photo.source.stem}.png")
+    (tmp_path / "work").mkdir()
+    found = prepare_masks(str(tmp_path), folder, read, tmp_path / "work")
+    assert (found.kind, found.unmasked) == ("folder", [])
+    assert found.masks is not None
+    with Image.open(found.masks / f"{read[0].name}.png") as mask:
+        assert np.array_equal(np.asarray(mask), given * (255 if white == 1 else 1))

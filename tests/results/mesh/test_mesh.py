@@ -255,6 +255,18 @@ def test_a_glb_holds_the_mesh_in_the_axes_of_splats_and_linear_color(tmp_path: P
     assert colors[3, 0] == pytest.approx(65535 * 0.21404, abs=2)  # 0.5 of IEC 61966-2-1 in linear light
     indices = np.frombuffer(body, "<u4", 12, places[primitive["indices"]])
     assert indices.tolist() == pyramid().faces.flatten().tolist()
+    accessors = document.root["accessors"]
+    assert [accessor.get("normalized", False) for accessor in accessors] == [
+        False,
+        False,
+        True,
+        False,
+    ]  # glTF 2.0, 3.6.2
+    assert [accessor["count"] for accessor in accessors] == [4, 4, 4, 12]
+    assert [accessor["bufferView"] for accessor in accessors] == [0, 1, 2, 3]
+    assert accessors[0]["min"] == positions.min(axis=0).tolist()
+    assert accessors[0]["max"] == positions.max(axis=0).tolist()
+    assert [view["target"] for view in document.root["bufferViews"]] == [34962, 34962, 34962, 34963]
 
 
 def test_the_command_writes_a_mesh_and_refuses_to_replace_one(
