@@ -6,15 +6,19 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 from run_configs import tiny_config
-from tiny_scenes import write_dataset
+from tiny_scenes import cloud, write_dataset
 
 from gsopt.cli.console import estimate_line
 from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.events import read_events
+from gsopt.geometry.cameras import Cameras
 from gsopt.training import estimate as estimates
 from gsopt.training.estimate import free_memory, of_sizes
 from gsopt.training.loop import train
@@ -101,3 +105,80 @@ def test_a_machine_that_reports_no_memory_refuses_nothing(tmp_path: Path, monkey
 def test_a_size_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="--max-memory"):
         TrainConfig(max_memory=text)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize(("growing", "copies"), [(True, 8), (False, 5)])
+def test_memory_is_linear_in_gaussians_pixels_and_images(degree: int, growing: bool, copies: int) -> None:
+    """A Gaussian's parameters, so many times, and 700 bytes in the kernels; frozen ones without moments."""
+
+    def memory(gaussians: int = 50, pixels: int = 9, images: int = 7, frozen: int = 0) -> int:
+        return of_sizes(gaussians, degree, pixels, images, 30, frozen, growing).memory
+
+    row = sum(4 * tensor.numel() for _, tensor in cloud(1, 0, sh_degree=degree).items())
+    assert memory(51) - memory(50) == copies * row + 700
+    assert memory(frozen=1) - memory() == 3 * row + 700
+    assert memory(pixels=10) - memory(pixels=9) == 120
+    assert memory(images=8) - memory(images=7) == 1
+    assert memory(0, 0, 0) == estimates.BASE_BYTES == of_sizes(0, 3, 0, 0, 0).memory
+
+
+def test_time_is_linear_in_steps_and_in_what_a_step_draws() -> None:
+    def seconds(gaussians: int, pixels: int, steps: int, frozen: int = 0) -> float:
+        return of_sizes(gaussians, 1, pixels, 0, steps, frozen).seconds
+
+    assert seconds(10**6, 0, 7) == pytest.approx(7 * estimates.SECONDS_PER_GAUSSIAN * 10**6)
+    assert seconds(0, 10**6, 7) == pytest.approx(7 * estimates.SECONDS_PER_PIXEL * 10**6)
+    assert seconds(400, 9, 7, frozen=600) == seconds(1000, 9, 7)
+    assert seconds(5, 6, 8) == pytest.approx(8 * (seconds(5, 0, 1) + seconds(0, 6, 1)))
+
+
+def test_a_run_that_just_fits_is_not_refused() -> None:
+    small = of_sizes(3000, 0, 100, 10**6, 10)
+    small.require(small.memory)
+    with pytest.raises(InputError, match=r"--max-gaussians 2000, a smaller image"):
+        small.require(small.memory - 1)
+    with pytest.raises(InputError, match=r"--max-gaussians 1000, a"):
+        small.require(small.memory - 2000 * small.gaussian_bytes)
+    with pytest.raises(InputError, match=r"Give a smaller image"):
+        small.require(small.memory - 2000 * small.gaussian_bytes - 1)
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [(10**9, "1.0 GB"), (10**9 - 1, "1000 MB"), (1_550_000_000, "1.6 GB"), (1_400_000, "1 MB"), (-5, "0 MB")],
+)
+def test_sizes_are_told_in_megabytes_up_to_a_gigabyte(size: int, text: str) -> None:
+    assert estimates.gigabytes(size) == text
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_the_estimate_of_a_run_counts_its_views(alpha: bool, strategy: str) -> None:
+    """Decoded images of all views and float targets of the input views, each up to its cache; an mcmc run fills its
+    budget, another one what its images ask for."""
+    cameras = [Cameras(torch.eye(4)[None], torch.eye(3)[None], width, height) for width, height in ((10, 20), (30, 5))]
+    black = torch.zeros(3, 4, 3, dtype=torch.uint8)
+    views = [SimpleNamespace(camera=camera, pixels=lambda: black) for camera in cameras]
+    scene: Any = SimpleNamespace(drawn=views, train=views, test=views[:1], has_alpha=alpha)
+    channels = 4 if alpha else 3
+    schedule = SimpleNamespace(iterations=100, max_sh_degree=2, refine_stop=50)
+    plan: Any = SimpleNamespace(
+        schedule=schedule, density=SimpleNamespace(max_gaussians=10**7, strategy=strategy), target_cache_mb=1e6
+    )
+    config = TrainConfig()
+    whole = channels * (200 + 150 + 200) + 4 * channels * (200 + 150)
+    assert estimates.image_bytes(config, plan, scene) == whole
+    plan.target_cache_mb = 1 / 1024
+    assert estimates.image_bytes(config, plan, scene) == channels * 550 + 1024
+    uncached = replace(config, data=replace(config.data, cache_mb=0))
+    assert estimates.image_bytes(uncached, plan, scene) == 1024
+    expected = 10**7 if strategy == "mcmc" else 20_000  # the least budget: the images are tiny
+    found = estimates.estimate(config, plan, scene, frozen=3)
+    assert found == of_sizes(expected, 2, 200, channels * 550 + 1024, 100, 3)
+    more = replace(config, init=replace(config.init, count=30_000))
+    assert estimates.estimate(more, plan, scene).gaussians == max(expected, 30_000)
+    schedule.refine_stop = 0
+    assert estimates.estimate(config, plan, scene) == of_sizes(
+        expected, 2, 200, channels * 550 + 1024, 100, growing=False
+    )
