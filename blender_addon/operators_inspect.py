@@ -137,8 +137,7 @@ class GSOPT_OT_filter(ReportingOperator, bpy.types.Operator):
 
     def do(self, context: Any) -> str:
         thing = active_splats(context)
-        splats = splat_object.read_mesh(thing.data, harmonics=False)
-        kept = chosen_filter(context.scene.gsopt, thing).keeps(splats)
+        kept = chosen_filter(context.scene.gsopt, thing).keeps(splat_object.MeshShapes(thing.data))
         splat_object.hide(thing.data, ~kept)
         loading.SUMMARIES.pop(thing.data.name, None)
         return f"{int(kept.sum()):,} of {len(kept):,} splats pass"

@@ -106,6 +106,25 @@ def read_mesh(mesh: Any, harmonics: bool = True) -> Splats:
     return Splats(get(mesh, "position"), get(mesh, "scale"), rotations, get(mesh, "opacity")[:, 0], base, sh)
 
 
+class MeshShapes:
+    """What filters look at; nothing is read before it is asked for."""
+
+    def __init__(self, mesh: Any) -> None:
+        self._mesh = mesh
+
+    @property
+    def positions(self) -> Any:
+        return get(self._mesh, "position")
+
+    @property
+    def scales(self) -> Any:
+        return get(self._mesh, "scale")
+
+    @property
+    def opacities(self) -> Any:
+        return get(self._mesh, "opacity")[:, 0]
+
+
 def hidden(mesh: Any) -> Any:
     """[N] which splats a filter hides."""
     if HIDDEN not in mesh.attributes:

@@ -107,7 +107,7 @@ def _archive(file: BinaryIO, path: Path) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
-        raise InputError(f"{path} is no .sog, a zip of images: {error}. Check the path.") from error
+        raise InputError(f"{path} is no .sog, a zip of images: {shortened(str(error))}. Check the path.") from error
 
 
 def _member(archive: zipfile.ZipFile, name: str, limit: int, path: Path) -> bytes:
@@ -118,7 +118,8 @@ def _member(archive: zipfile.ZipFile, name: str, limit: int, path: Path) -> byte
     except KeyError as error:
         raise InputError(f"{path} lacks {shortened(name)}. Copy or export it again.") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: {shortened(name)} is damaged: {error}. Copy or export it again.") from error
+        what = f"{shortened(name)} is damaged: {shortened(str(error))}"  # zipfile quotes names as long as the file
+        raise InputError(f"{path}: {what}. Copy or export it again.") from error
     if len(data) > limit:
         raise InputError(f"{path}: {shortened(name)} has more than {limit} bytes. It is damaged or hostile.")
     return data

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from made_splats import random_splats
 
-from blender_addon.core import colmap, dataset
+from blender_addon.core import colmap, dataset, statistics
 from blender_addon.core.cameras import GL_FROM_CV, read_views
 from blender_addon.core.errors import GsoptError, InputError
 from blender_addon.core.statistics import Filter, summary
@@ -183,6 +183,12 @@ def test_each_filter_keeps_what_it_says() -> None:
     assert np.array_equal(Filter(box_from_local=box).keeps(splats), inside)
     both = Filter(opacity=(0.5, 1), farthest=2.0).keeps(splats)
     assert np.array_equal(both, (splats.opacities >= 0.5) & (np.linalg.norm(splats.positions, axis=1) <= 2))
+
+
+def test_outliers_are_found_among_more_splats_than_the_medians_look_at() -> None:
+    splats = random_splats(statistics.SAMPLE + 1)
+    splats.positions[3], splats.scales[4, 1], splats.positions[-1] = 1e4, 50, 1e30
+    assert np.flatnonzero(statistics.outliers(splats)).tolist() == [3, 4, statistics.SAMPLE]
 
 
 def test_at_most_never_shows_more_and_keeps_small_sets() -> None:

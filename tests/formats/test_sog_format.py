@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from splat_laws import require_short
 from splat_samples import make_splats
 
 from gsopt.errors import InputError
@@ -141,6 +142,19 @@ def test_an_image_that_is_none_is_refused(tmp_path: Path, bundle: tuple[Members,
     write(tmp_path / "b.sog", {**bundle[0], "quats.webp": b"RIFF0000WEBPVP8L rubbish"})
     with pytest.raises(InputError, match="no image"):
         load_splats(tmp_path / "b.sog")
+
+
+def test_a_member_under_another_name_is_refused_in_few_words(
+    tmp_path: Path, bundle: tuple[Members, dict[str, Any]]
+) -> None:
+    long, path = "n" * 3000, tmp_path / "bad.sog"
+    write(path, {long: json.dumps(bundle[1]).encode()})
+    data = path.read_bytes()
+    start = data.rindex(long.encode())  # the archive's directory, behind the member's own header
+    path.write_bytes(data[:start] + b"meta.json".ljust(len(long), b"\0") + data[start + len(long) :])
+    with pytest.raises(InputError, match="damaged") as refused:
+        load_splats(path)
+    require_short(refused.value, path)
 
 
 def test_bombs_are_not_unpacked(tmp_path: Path, bundle: tuple[Members, dict[str, Any]]) -> None:
