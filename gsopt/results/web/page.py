@@ -12,7 +12,7 @@ from string import Template
 from gsopt.results.web.payload import Payload
 from gsopt.results.web.scene import WebScene
 
-PROGRAM = ("shaders.js", "keyframes.js", "picking.js", "viewer.js")
+PROGRAM = ("shaders.js", "renderer.js", "keyframes.js", "picking.js", "viewer.js")
 STYLE = "html, body { margin: 0; height: 100%; } .gsopt-viewer { height: 100%; }\n"
 
 

@@ -20,6 +20,8 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.morton import morton_order
 
 Bytes = NDArray[np.uint8]
+LEVEL = 7
+"""Of deflate; 9 takes six times as long for 0.7 % fewer bytes of a million splats."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ def packed_splats(gaussians: Gaussians, path: Path) -> Payload:
     gaussians = storable(gaussians, path)
     gaussians = gaussians.select(morton_order(gaussians.means.double().flip(-1)))
     fraction_bits, streams = pack(gaussians, path)
-    packer = zlib.compressobj(9)
+    packer = zlib.compressobj(LEVEL)
     data = b"".join(packer.compress(plane.tobytes()) for plane in planes(streams, len(gaussians)))
     return Payload(data + packer.flush(), len(gaussians), gaussians.sh_degree, fraction_bits)
 

@@ -1,11 +1,14 @@
-// The image model of docs/math.md (equations 1 to 9), one instance per splat.
+// The image model of docs/math.md (equations 1 to 9). Four vertices are a splat, BATCH splats are an instance.
 "use strict";
+const BATCH = 4096;
 const SPLAT_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp usampler2D;
 uniform usampler2D shapes;
 uniform sampler2D tints;
+uniform usampler2D order;  // numbers of the splats, farthest first
+uniform int drawn;         // how many of them
 uniform mat4 camFromWorld;
 uniform vec3 center;      // of the camera
 uniform vec4 intrinsics;  // fx, fy, cx, cy in px
@@ -16,11 +19,11 @@ uniform float eps2d;
 uniform int degree;
 uniform int stride;
 uniform bool antialiased;
-in uint index;
 out vec3 color;
 out vec2 offset;
 out float opacity;
 
+const int BATCH = ${BATCH};
 const float C0 = 0.28209479177387814, HALF = 0.7071067811865476;
 
 uvec4 shape(int texel) { int w = textureSize(shapes, 0).x; return texelFetch(shapes, ivec2(texel % w, texel / w), 0); }
@@ -71,7 +74,9 @@ vec3 seen(int splat, vec3 base, vec3 d) {
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside: nothing is drawn
-  int splat = int(index);
+  int place = BATCH * gl_InstanceID + (gl_VertexID >> 2), width = textureSize(order, 0).x;
+  if (place >= drawn) return;
+  int splat = int(texelFetch(order, ivec2(place % width, place / width), 0).x);
   uvec4 word = shape(2 * splat);
   vec3 mean = uintBitsToFloat(word.xyz);
   vec3 t = (camFromWorld * vec4(mean, 1.0)).xyz;
@@ -92,11 +97,11 @@ void main() {
   float reach = sqrt(2.0 * log(255.0 * opacity)), mid = 0.5 * (xx + yy);
   float spread = length(vec2(0.5 * (xx - yy), xy)), wide = mid + spread, thin = max(det / wide, 1e-6);
   vec2 axis = abs(xy) > 1e-6 * mid ? normalize(vec2(wide - yy, xy)) : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
-  offset = reach * (vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0);
-  vec2 place = t.xy / t.z * intrinsics.xy + intrinsics.zw
+  offset = reach * (vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0);
+  vec2 pixel = t.xy / t.z * intrinsics.xy + intrinsics.zw
              + offset.x * sqrt(wide) * axis + offset.y * sqrt(thin) * vec2(-axis.y, axis.x);
   color = seen(splat, (base.rgb / 255.0 - 0.5) / 0.15, normalize(mean - center));
-  gl_Position = vec4(2.0 * place.x / size.x - 1.0, 1.0 - 2.0 * place.y / size.y, 0.0, 1.0);
+  gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es

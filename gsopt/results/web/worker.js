@@ -1,7 +1,13 @@
 // Unpacks the splats once, then sorts them for each view: farthest first.
 // The payload is a deflated sequence of byte planes; gsopt/results/web/payload.py writes it and names every plane.
 "use strict";
-let means, count, scaleCodes, turnCodes, opacityCodes;
+let means, count, orderTexels, scaleCodes, turnCodes, opacityCodes;
+
+function decoded(base64) {
+  const letters = atob(base64), bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; ++i) bytes[i] = letters.charCodeAt(i);
+  return bytes;
+}
 
 async function inflated(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -49,9 +55,9 @@ function colors(planes, stride, texels) {
   return out;
 }
 
-async function unpack({ bytes, scene, geometryTexels, colorTexels }) {
-  const plain = await inflated(bytes);
-  count = scene.count;
+async function unpack({ base64, scene, geometryTexels, colorTexels, orderTexels: texels }) {
+  const plain = await inflated(decoded(base64));
+  [count, orderTexels] = [scene.count, texels];
   let at = 0;
   const planes = { next: () => plain.subarray(at, at += count) };
   means = positions(planes, 2 ** -scene.fractionBits);
@@ -60,14 +66,15 @@ async function unpack({ bytes, scene, geometryTexels, colorTexels }) {
 }
 
 // Stable radix sort of the depths' bits; those of positive floats are in order. Splats behind the near plane are left out.
+// The n numbers begin an array that fills a texture.
 function sorted([a, b, c, d], near) {
   const keys = new Float32Array(count), bits = new Uint32Array(keys.buffer);
-  let order = new Uint32Array(count), n = 0;
+  let order = new Uint32Array(orderTexels), n = 0;
   for (let i = 0; i < count; ++i) {
     const z = a * means[3 * i] + b * means[3 * i + 1] + c * means[3 * i + 2] + d;
     if (z > near) { keys[i] = z; order[n++] = i; }
   }
-  let next = new Uint32Array(n);
+  let next = new Uint32Array(orderTexels);
   for (const shift of [0, 16]) {
     const starts = new Uint32Array(65537);
     for (let i = 0; i < n; ++i) ++starts[(~bits[order[i]] >>> shift & 0xffff) + 1];
@@ -75,7 +82,7 @@ function sorted([a, b, c, d], near) {
     for (let i = 0; i < n; ++i) next[starts[~bits[order[i]] >>> shift & 0xffff]++] = order[i];
     [order, next] = [next, order];
   }
-  return order.slice(0, n);
+  return { order, n };
 }
 
 // Columns of the rotation of a splat: the codes are those of `quaternion` in shaders.js.
@@ -119,9 +126,9 @@ function picked({ eye, ray, depthRow, near, blur }) {
 
 onmessage = ({ data }) => {
   if (data.pick) postMessage({ point: picked(data.pick) });
-  else if (data.bytes) unpack(data).catch(error => postMessage({ error: String(error) }));
+  else if (data.base64) unpack(data).catch(error => postMessage({ error: String(error) }));
   else {
-    const order = sorted(data.depthRow, data.near);
-    postMessage({ order }, [order.buffer]);
+    const { order, n } = sorted(data.depthRow, data.near);
+    postMessage({ order, n }, [order.buffer]);
   }
 };

@@ -112,6 +112,24 @@ def test_the_mouse_turns_and_keys_step_through_the_views(browser: Tab, run: Path
     assert psnr(again, expected) > 60
 
 
+def test_the_image_turns_while_the_worker_sorts(browser: Tab, run: Path, tmp_path: Path) -> None:
+    """The second sort of this page never ends; what is drawn follows the mouse all the same, in the first sort's order."""
+    text = (run / "page.html").read_text(encoding="utf-8")
+    call = "const { order, n } = sorted("
+    assert text.count(call) == 1
+    stuck = tmp_path / "stuck.html"
+    stuck.write_text(text.replace(call, f"while (self.sortedOnce); self.sortedOnce = true; {call}"), encoding="utf-8")
+    images = [shown(browser, stuck, "view=1&plain")]
+    for x in (90, 130):
+        for kind, place in (("mousePressed", x - 40), ("mouseMoved", x), ("mouseReleased", x)):
+            browser.call("Input.dispatchMouseEvent", type=kind, x=place, y=60, button="left", buttons=1, clickCount=1)
+        end = time.monotonic() + PATIENCE
+        while psnr(image := browser.screenshot(), images[-1]) > 30:
+            assert time.monotonic() < end, "the image stands still"
+        images.append(image)
+    assert browser.value(DRAWN) == "1"  # of the first view: nothing was marked as sorted and drawn since
+
+
 def clicked(part: str) -> str:
     return f"document.querySelector('[data-part={part}]').click()"
 
