@@ -107,7 +107,7 @@ def read_mesh(mesh: Any, harmonics: bool = True) -> Splats:
 
 
 class MeshShapes:
-    """What filters look at; nothing is read before it is asked for."""
+    """A mesh as filters see it: each attribute is read when it is asked for."""
 
     def __init__(self, mesh: Any) -> None:
         self._mesh = mesh

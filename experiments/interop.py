@@ -34,7 +34,16 @@ from gsopt.results.finished_run import FinishedRun, open_run
 HERE = Path(__file__).resolve().parent
 RESULT = HERE / "results/interop.json"
 PAGE = HERE.parent / "docs/howto/formats.md"
-FLOORS = {".ply": 90.0, ".compressed.ply": 45.0, ".splat": 30.0, ".spz": 40.0, ".sog": 35.0, ".glb": 80.0}
+FLOORS = {
+    ".usda": 80.0,
+    ".usdc": 80.0,
+    ".ply": 90.0,
+    ".compressed.ply": 45.0,
+    ".splat": 30.0,
+    ".spz": 40.0,
+    ".sog": 35.0,
+    ".glb": 80.0,
+}
 """dB; a wrong axis, sign or logarithm falls far below."""
 THEY_READ = {".ply", ".compressed.ply", ".splat", ".spz", ".sog"}
 THEY_WRITE = {".ply", ".compressed.ply", ".spz", ".sog", ".glb"}

@@ -4,8 +4,8 @@
 
 Wants a Chromium (software rendering, no network) and the extra `viewer`. For each run: PSNR of the page against
 `gsopt render` at the poses of up to 6 input views, the page's size beside that of a .spz. `--draw` rewrites the table
-of docs/howto/share.md and results/web_page.json; `--picture` draws docs/img/share.jpg of the first run. `--split N`
-adds the first run with its splats split into N, and what the browser needs to load and to sort them.
+of docs/howto/share.md and results/web_page.json; `--picture` draws docs/img/share.jpg and view.jpg of the first run.
+`--split N` adds the first run with its splats split into N, and what the browser needs to load and to sort them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import math
 import shutil
 import sys
 import tempfile
+import time
 from pathlib import Path
 from statistics import mean, median
 
@@ -35,11 +36,17 @@ from gsopt.events import write_atomic  # noqa: E402
 from gsopt.formats import save_splats  # noqa: E402
 from gsopt.gaussians import Gaussians  # noqa: E402
 from gsopt.geometry.quats import rotation_matrices  # noqa: E402
+from gsopt.results import viewer  # noqa: E402
 from gsopt.results.finished_run import open_run  # noqa: E402
 from gsopt.results.web import save_run_page  # noqa: E402
 
 RESULT, PAGE = HERE / "results/web_page.json", HERE.parent / "docs/howto/share.md"
 PICTURE, PICTURE_SIZE = HERE.parent / "docs/img/share.jpg", (1000, 620)
+VIEW_PICTURE, VIEW_SIZE = HERE.parent / "docs/img/view.jpg", (1280, 720)
+LOADED = 0.15
+"""Share of the viewer's pixels that are not white when its splats have come."""
+SETTLED = 10
+"""Seconds after which the viewer's camera and colors stand still."""
 VIEWS = 6
 SORTS = 6
 SPY = """
@@ -56,7 +63,7 @@ window.Worker = class extends Worker {
   }
 };
 """
-"""Notes, in milliseconds, how long the worker takes to answer and how long the page's own thread takes the answer in."""
+"""Notes, in milliseconds, how long the worker takes to answer and how long the page itself takes to use it."""
 DRAWN = "document.querySelector('.gsopt-viewer') && document.querySelector('.gsopt-viewer').dataset.drawn"
 
 
@@ -81,6 +88,22 @@ def measured(run: Path, folder: Path, browser: Tab) -> dict:
         figures.append(round(10 * math.log10(255**2 / error), 2))
     sizes = {"page_bytes": page.stat().st_size, "spz_bytes": spz.stat().st_size}
     return {"run": run.name, "splats": len(finished.gaussians), "psnr": figures, **sizes}
+
+
+def viewer_screenshot(run: Path, browser: Tab) -> np.ndarray:
+    """`gsopt view`, when the splats have come and stand still."""
+    shown = viewer.SplatViewer("127.0.0.1", 0)
+    try:
+        next(viewer.view_run(shown, run))
+        browser.open(f"http://127.0.0.1:{shown.port}", *VIEW_SIZE)
+        browser.wait_for("document.querySelector('canvas') !== null")
+        while (browser.screenshot()[:, :800] < 240).any(axis=2).mean() < LOADED:
+            time.sleep(1)
+        time.sleep(SETTLED)
+        image = browser.screenshot()
+        return image
+    finally:
+        shown.stop()
 
 
 def split(gaussians: Gaussians, count: int) -> Gaussians:
@@ -158,6 +181,7 @@ def main() -> None:
         if flags.picture:
             page = Path(folder) / f"{flags.runs[0].name}.html"
             Image.fromarray(screenshot(browser, page, "", *PICTURE_SIZE)).save(PICTURE, quality=88)
+            Image.fromarray(viewer_screenshot(flags.runs[0], browser)).save(VIEW_PICTURE, quality=88)
     if flags.draw:
         write_atomic(RESULT, (json.dumps({"machine": machine(), "runs": records}, indent=1) + "\n").encode())
         draw(records)

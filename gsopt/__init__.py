@@ -18,12 +18,16 @@ _HOME = {
     "RasterSettings": "gsopt.raster.backend",
     "Scene": "gsopt.data.scene",
     "TrainConfig": "gsopt.config.train",
+    "clean": "gsopt.results.clean_files",
     "evaluate": "gsopt.results.evaluation",
     "extract_mesh": "gsopt.results.mesh.extract",
     "load_scene": "gsopt.data.scene",
     "load_splats": "gsopt.formats",
+    "measure": "gsopt.results.measure",
+    "merge": "gsopt.results.merge",
     "rasterize": "gsopt.raster.api",
     "reconstruct": "gsopt.training.reconstruct",
+    "save_run_page": "gsopt.results.web",
     "save_splats": "gsopt.formats",
     "train": "gsopt.training.loop",
 }
@@ -36,12 +40,16 @@ __all__ = [
     "RasterSettings",
     "Scene",
     "TrainConfig",
+    "clean",
     "evaluate",
     "extract_mesh",
     "load_scene",
     "load_splats",
+    "measure",
+    "merge",
     "rasterize",
     "reconstruct",
+    "save_run_page",
     "save_splats",
     "train",
 ]
@@ -55,8 +63,12 @@ if TYPE_CHECKING:
     from gsopt.geometry.cameras import Cameras
     from gsopt.raster.api import rasterize
     from gsopt.raster.backend import RasterSettings
+    from gsopt.results.clean_files import clean
     from gsopt.results.evaluation import evaluate
+    from gsopt.results.measure import measure
+    from gsopt.results.merge import merge
     from gsopt.results.mesh.extract import extract_mesh
+    from gsopt.results.web import save_run_page
     from gsopt.training.loop import train
     from gsopt.training.reconstruct import reconstruct
 

@@ -20,7 +20,7 @@ LARGE = 20.0
 
 
 class Shapes(Protocol):
-    """What filters look at; a mesh reads each only when it is asked for."""
+    """Filters look at these three; a mesh reads each only when it is asked for."""
 
     @property
     def positions(self) -> Floats: ...

@@ -52,15 +52,13 @@ def main(argv: Sequence[str]) -> int:
 
 def clean_run(flags: Flags) -> int:
     """Decide by the input views of a run."""
-    from gsopt.data.refined_poses import with_refined_poses
-    from gsopt.data.scene import load_scene
     from gsopt.formats import save_splats
     from gsopt.results import clean, clean_files
     from gsopt.results.finished_run import open_run
     from gsopt.results.measure import units_of
 
     run = open_run(flags.source)
-    views = with_refined_poses(load_scene(run.config.data), run.path).train
+    views = clean_files.input_views(run)
     found = clean.findings(run, views, flags.box)
     keep = clean.kept(found, len(run.gaussians))
     report(found, len(keep))

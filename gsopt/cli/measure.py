@@ -28,18 +28,11 @@ def main(argv: Sequence[str]) -> int:
     """Measure, print and return 0."""
     flags = tyro.cli(Flags, prog="gsopt measure", args=list(argv))
 
-    from gsopt.events import refuse_links
-    from gsopt.results.finished_run import open_run
-    from gsopt.results.measure import UNITS_FILE, distance, meters, record_scale, units_of
+    from gsopt.results.measure import UNITS_FILE, measure
 
-    length = None if flags.unit_length is None else meters(flags.unit_length)
-    run = open_run(flags.run)
-    units = units_of(flags.run)
-    found = distance(run, flags.start, flags.end)
-    if length is not None:
-        refuse_links(flags.run)
-        units = record_scale(flags.run, length, flags.start, flags.end, found)
-        print(f"{flags.run / UNITS_FILE}: 1 scene unit is {units.meters_per_unit:.6g} m")
-    known = "" if units.meters_per_unit is None else f", {found * units.meters_per_unit:.6g} m"
-    print(f"{found:.6g} scene units{known}")
+    found = measure(flags.run, flags.start, flags.end, flags.unit_length or "")
+    if flags.unit_length and found.meters is not None:
+        print(f"{flags.run / UNITS_FILE}: 1 scene unit is {found.meters / found.units:.6g} m")
+    known = "" if found.meters is None else f", {found.meters:.6g} m"
+    print(f"{found.units:.6g} scene units{known}")
     return 0

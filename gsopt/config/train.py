@@ -314,6 +314,9 @@ class TrainConfig:
     rest; auto: as few as fit into memory."""
     antialiased: bool = False
     """Mip-Splatting's 2D filter."""
+    clean: bool = False
+    """Leave out the splats that no input view needs after the last step, as gsopt clean does, unless views without a
+    part in the decision lose by it."""
     checkpoint_every: Count = 1000
     """Steps between two checkpoints; 0 = only at the end."""
     preview_every: Count = 500

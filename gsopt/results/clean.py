@@ -18,7 +18,7 @@ from gsopt.data.scene import View
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.projection import project
-from gsopt.metrics import psnr
+from gsopt.metrics import capped_psnr
 from gsopt.raster.api import Rendering, rasterize
 from gsopt.raster.backend import ALPHA_MIN, Backend, RasterSettings
 from gsopt.raster.threads import one_torch_thread
@@ -34,6 +34,8 @@ NEAREST = 0.05
 """Quantile of a view's depths that counts as its nearest surfaces."""
 SEEN = 0.5
 """Weight, px, from which on a view sees a splat."""
+FOLDS = 4
+"""Shares of the input views that `left_out_change` judges one after the other."""
 MAX_COST = 0.02
 """dB of input-view PSNR that one rule may cost: floaters before a camera help that one camera."""
 CHECKED_VIEWS = 24
@@ -127,6 +129,23 @@ def findings(run: FinishedRun, views: Sequence[View], box: tuple[float, ...] | N
     return found
 
 
+@one_torch_thread()
+def left_out_change(run: FinishedRun, views: Sequence[View]) -> float:
+    """Mean change in dB that cleaning makes to views without a part in the decision, over shares of the input views.
+
+    NaN for a single view, which leaves none to decide.
+    """
+    changes = []
+    for fold in range(min(FOLDS, len(views)) if len(views) > 1 else 0):
+        deciding = [view for i, view in enumerate(views) if i % FOLDS != fold]
+        keep = kept(findings(run, deciding), len(run.gaussians))
+        before, after = (
+            input_psnr(run, splats, views[fold::FOLDS]) for splats in (run.gaussians, run.gaussians.select(keep))
+        )
+        changes.append(after - before)
+    return sum(changes) / len(changes) if changes else math.nan
+
+
 def findings_without_views(gaussians: Gaussians, box: tuple[float, ...] | None = None) -> list[Finding]:
     """Splats of a file that nobody can see: opacity below the rasterizer's least alpha, and those outside a box."""
     faint = gaussians.opacities < ALPHA_MIN
@@ -151,7 +170,7 @@ def input_psnr(run: FinishedRun, gaussians: Gaussians, views: Sequence[View]) ->
             draw(gaussians, view.camera, run.backend, run.settings, run.background),
             truth(view, run.background),
         )
-        total += float(psnr(drawn[None].float() / 255, target[None].float() / 255))
+        total += float(capped_psnr(drawn[None].float() / 255, target[None].float() / 255))
     return total / max(1, len(views))
 
 

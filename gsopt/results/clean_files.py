@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,7 +12,8 @@ from jaxtyping import Bool
 from PIL import Image
 from torch import Tensor
 
-from gsopt.data.scene import View
+from gsopt.data.refined_poses import with_refined_poses
+from gsopt.data.scene import View, load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.events import write_atomic
 from gsopt.formats import is_antialiased, save_splats
@@ -20,8 +21,9 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.camera_paths import turntable_path
 from gsopt.geometry.cameras import Cameras
+from gsopt.results.clean import Finding, findings, kept, left_out_change
 from gsopt.results.evaluation import evaluate, read_metrics
-from gsopt.results.finished_run import FinishedRun, draw, look_at_point, with_longest_side
+from gsopt.results.finished_run import FinishedRun, draw, look_at_point, open_run, with_longest_side
 from gsopt.results.report import write_report
 from gsopt.results.video import as_image
 
@@ -29,6 +31,44 @@ SPLATS, BEFORE, PICTURE = "splat.ply", "splat.before-clean.ply", "clean.png"
 METRICS, METRICS_BEFORE = "metrics.json", "metrics.before-clean.json"
 REPORT = "report.html"
 SIDE, GAP, ROWS = 360, 8, 3
+NO_LOSS = 0.001
+"""dB that count as none."""
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """The findings of `clean`, and the splats that stay."""
+
+    findings: list[Finding]
+    gaussians: Gaussians
+    left_out: int
+    """Splats that go."""
+
+
+def clean(run: Path | str | FinishedRun, *, box: tuple[float, ...] | None = None, dry_run: bool = False) -> Cleaning:
+    """Leave out the splats of a finished run that no input view needs; its first splat.ply is kept beside it.
+
+    `box`: x y z X Y Z, scene units; what lies outside goes too. `dry_run`: nothing is written.
+    """
+    opened = run if isinstance(run, FinishedRun) else open_run(Path(run))
+    found = findings(opened, input_views(opened), box)
+    keep = kept(found, len(opened.gaussians))
+    if not dry_run and not bool(keep.all()):
+        replace_splats(opened, keep)
+    return Cleaning(found, opened.gaussians.select(keep), int((~keep).sum()))
+
+
+def clean_where_it_helps(run: Path) -> tuple[Cleaning | None, float]:
+    """Clean a run that was not evaluated yet, unless views without a part in the decision lose by it: what was done,
+    or None, and the change in those views, dB."""
+    opened = open_run(run)
+    change = left_out_change(opened, input_views(opened))
+    return (clean(opened) if change >= -NO_LOSS else None), change
+
+
+def input_views(run: FinishedRun) -> tuple[View, ...]:
+    """The input views of a run, with refined poses where it has them."""
+    return with_refined_poses(load_scene(run.config.data), run.path).train
 
 
 def replace_splats(run: FinishedRun, keep: Bool[Tensor, "N"]) -> None:
@@ -46,10 +86,15 @@ def replace_splats(run: FinishedRun, keep: Bool[Tensor, "N"]) -> None:
 def measure_again(run: Path) -> None:
     """Write metrics.json and the report of an evaluated run anew; the first are kept as metrics.before-clean.json."""
     metrics, before = run / METRICS, run / METRICS_BEFORE
-    if not metrics.is_file():
-        return
-    if not before.exists():
+    if metrics.is_file() and not before.exists():
         os.link(metrics, before)
+    evaluate_again(run)
+
+
+def evaluate_again(run: Path) -> None:
+    """Write metrics.json and the report anew where a run has them."""
+    if not (run / METRICS).is_file():
+        return
     mean = read_metrics(run).get("mean")
     evaluate(run, vgg=isinstance(mean, dict) and mean.get("lpips_vgg") is not None)
     if (run / REPORT).is_file():
@@ -57,7 +102,10 @@ def measure_again(run: Path) -> None:
 
 
 def undo(run: Path) -> None:
-    """Bring splat.before-clean.ply back as splat.ply, and the figures that belong to it."""
+    """Bring splat.before-clean.ply back as splat.ply, and the figures that belong to it.
+
+    A run that was cleaned before its evaluation is evaluated again.
+    """
     before = run / BEFORE
     if before.is_symlink() or not before.is_file():
         raise UsageError(f"{run} was not cleaned: there is no {BEFORE}. Nothing was changed.")
@@ -66,6 +114,8 @@ def undo(run: Path) -> None:
         os.replace(run / METRICS_BEFORE, run / METRICS)
         if (run / REPORT).is_file():
             write_report(run)
+    else:
+        evaluate_again(run)
 
 
 def write_picture(run: FinishedRun, keep: Bool[Tensor, "N"], views: tuple[View, ...]) -> None:

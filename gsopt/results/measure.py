@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,10 +18,10 @@ from gsopt.data import files
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.scene import View, load_scene
 from gsopt.errors import InputError, UsageError
-from gsopt.events import to_json, write_atomic
+from gsopt.events import refuse_links, to_json, write_atomic
 from gsopt.formats.units import Units, read_units, units_from_notes
 from gsopt.raster.threads import one_torch_thread
-from gsopt.results.finished_run import FinishedRun
+from gsopt.results.finished_run import FinishedRun, open_run
 from gsopt.results.mesh.median_depth import depth_view
 
 UNITS_FILE = "units.json"
@@ -49,6 +50,30 @@ def _scale(path: Path) -> float | None:
     if found.meters_per_unit is None:
         raise InputError(f"{path} must name meters_per_unit, a number above 0. Remove it, or measure again.")
     return found.meters_per_unit
+
+
+@dataclass(frozen=True)
+class Length:
+    """A distance in a run."""
+
+    units: float
+    """Scene units."""
+    meters: float | None
+    """A known scale of the run gives them, else None."""
+
+
+def measure(run: Path | str | FinishedRun, start: str, end: str, unit_length: str = "") -> Length:
+    """The distance between two points of a run, each `X,Y,Z` or `VIEW@COLUMN,ROW`: what that pixel of a view shows.
+
+    `unit_length`, as `0.25m`: the true distance; RUN/units.json keeps the scale that follows, for exports and Blender.
+    """
+    length = meters(unit_length) if unit_length else None
+    opened = run if isinstance(run, FinishedRun) else open_run(Path(run))
+    units, found = units_of(opened.path), distance(opened, start, end)
+    if length is not None:
+        refuse_links(opened.path)
+        units = record_scale(opened.path, length, start, end, found)
+    return Length(found, None if units.meters_per_unit is None else found * units.meters_per_unit)
 
 
 def distance(run: FinishedRun, start: str, end: str) -> float:

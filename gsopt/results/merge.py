@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from gsopt.errors import InputError
 from gsopt.formats.placement import placed
 from gsopt.gaussians import Gaussians
 from gsopt.results.clean import pixel_sums
-from gsopt.results.finished_run import FinishedRun, draw, truth
+from gsopt.results.finished_run import FinishedRun, draw, open_run, truth
 
 MIN_SHARED = 3
 MAX_DEGREES, MAX_SHIFT = 2.0, 0.05
@@ -75,8 +76,9 @@ class Merged:
     """Splats of the first and of the second that stay."""
 
 
-def merge(first: FinishedRun, second: FinishedRun) -> Merged:
+def merge(first: Path | str | FinishedRun, second: Path | str | FinishedRun) -> Merged:
     """Both runs in one. InputError where no photos in common say how they lie to each other."""
+    first, second = (run if isinstance(run, FinishedRun) else open_run(Path(run)) for run in (first, second))
     if first.settings.antialiased != second.settings.antialiased:
         raise InputError("One run was trained with --antialiased, the other without. Train both alike.")
     scenes = [with_refined_poses(load_scene(run.config.data), run.path) for run in (first, second)]

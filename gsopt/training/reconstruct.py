@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -76,6 +77,8 @@ def reconstruct(
             result = train(config, run, resume=resume, on_progress=on_progress, done=False)
         if result.stopped:
             return Reconstruction(result.run, result.gaussians, None, None)
+        if config.clean:
+            result = _cleaned(result, log)
         log(f"trained in {timedelta(seconds=round(result.train_seconds))}; evaluating {result.run / 'splat.ply'}")
         metrics, report = _evaluated(config, result, vgg, on_progress, stop)
     return Reconstruction(result.run, result.gaussians, metrics, report)
@@ -174,6 +177,21 @@ def _with_masks(config: TrainConfig, run: Path, log: Report) -> TrainConfig:
     if config.data.masks != "auto":
         return config
     return replace(config, data=with_made_masks(config.data, run.absolute().parent, log))
+
+
+def _cleaned(result: TrainResult, log: Report) -> TrainResult:
+    """Without the splats that no input view needs, where views that were left out of the decision do not lose."""
+    from gsopt.results.clean_files import clean_where_it_helps
+
+    cleaning, change = clean_where_it_helps(result.run)
+    judged = f"views without a part in the decision change by {change:+.4f} dB"
+    if math.isnan(change):
+        judged = "one input view leaves none to judge by"
+    if cleaning is None:
+        log(f"not cleaned: {judged}")
+        return result
+    log(f"cleaned: {cleaning.left_out:,} of {len(result.gaussians):,} splats go; {judged}")
+    return replace(result, gaussians=cleaning.gaussians)
 
 
 def _evaluated(

@@ -11,12 +11,13 @@ import torch
 from finished_runs import make_run, splats
 from PIL import Image
 
+import gsopt
 from gsopt.cli import main
 from gsopt.data.scene import load_scene
 from gsopt.formats import load_splats, save_splats
 from gsopt.formats.ply import ply_antialiased
 from gsopt.gaussians import Gaussians
-from gsopt.results import clean
+from gsopt.results import clean, clean_files
 from gsopt.results.evaluation import evaluate
 from gsopt.results.finished_run import FinishedRun, open_run
 
@@ -141,6 +142,37 @@ def test_the_metrics_of_a_cleaned_run_are_those_of_its_splats(tmp_path: Path) ->
     assert cleaned == evaluate(run) | {"protocol": cleaned["protocol"]}
     assert main(["clean", str(run), "--undo"]) == 0
     assert (run / "metrics.json").read_bytes() == first
+
+
+def test_views_without_a_part_in_the_decision_judge_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A splat that nobody sees may go. Where every splat is named and no input view objects, those left out do."""
+    run = dirty_run(tmp_path, blob((0.0, 0.0, 90.0), 0.01, 0.9))
+    assert abs(clean.left_out_change(run, views_of(run))) < 1e-6
+    assert math.isnan(clean.left_out_change(run, views_of(run)[:1]))
+    monkeypatch.setattr(clean, "UNSEEN_WEIGHT", 1e6)
+    monkeypatch.setattr(clean, "MAX_COST", math.inf)
+    assert clean.left_out_change(run, views_of(run)) < -1
+    cleaning, change = clean_files.clean_where_it_helps(run.path)
+    assert cleaning is None
+    assert change < -1
+    assert len(load_splats(run.path / "splat.ply")) == GOOD + 1
+
+
+def test_python_cleans_as_the_command_does(tmp_path: Path) -> None:
+    run = dirty_run(tmp_path, blob((0.0, 0.0, 90.0), 0.01, 0.9)).path
+    assert (gsopt.clean(run, dry_run=True).left_out, len(load_splats(run / "splat.ply"))) == (1, GOOD + 1)
+    found = gsopt.clean(run)
+    assert (found.left_out, len(found.gaussians), len(load_splats(run / "splat.ply"))) == (1, GOOD, GOOD)
+    assert main(["clean", str(run), "--undo"]) == 0
+    assert len(load_splats(run / "splat.ply")) == GOOD + 1
+
+
+def test_undo_measures_a_run_that_was_cleaned_before_it_was_evaluated(tmp_path: Path) -> None:
+    run = dirty_run(tmp_path, blob((0.0, 0.0, 90.0), 0.01, 0.9)).path
+    assert clean_files.clean_where_it_helps(run)[0] is not None
+    evaluate(run)
+    assert main(["clean", str(run), "--undo"]) == 0
+    assert json.loads((run / "metrics.json").read_text())["n_gaussians"] == GOOD + 1
 
 
 def test_a_file_loses_what_nobody_can_see(tmp_path: Path) -> None:

@@ -56,6 +56,22 @@ def test_python_and_the_command_line_write_the_same_run(data: Path, tmp_path: Pa
     assert any("evaluating" in line for line in lines)
 
 
+def test_clean_leaves_out_what_no_input_view_needs_before_the_run_is_evaluated(data: Path, tmp_path: Path) -> None:
+    """Random Gaussians, most of them outside of every view; the plain run has them all."""
+    lines: list[str] = []
+    settings = SHORT | {"init": {"method": "random", "count": 400}}
+    plain = gsopt.reconstruct(str(data), tmp_path / "plain", **settings)
+    for resume in (False, True):  # the second time from the last checkpoint, which has all splats
+        arguments: dict[str, Any] = {"resume": True} if resume else settings | {"clean": True}
+        result = gsopt.reconstruct(None if resume else str(data), tmp_path / "run", log=lines.append, **arguments)
+        assert result.metrics is not None
+        left = result.metrics["n_gaussians"]
+        assert left == len(result.gaussians) == len(gsopt.load_splats(result.run / "splat.ply"))
+        assert 0 < left < len(plain.gaussians)
+        assert f"cleaned: {len(plain.gaussians) - left:,} of {len(plain.gaussians):,} splats go" in lines[-2]
+    assert (tmp_path / "run/splat.before-clean.ply").read_bytes() == (tmp_path / "plain/splat.ply").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("masks", "sought", "left"),
     [("given", "auto", "given"), ("none", "none", "none"), ("DIR", "DIR", "given")],

@@ -21,8 +21,8 @@ def save_page(path: Path, gaussians: Gaussians, scene: WebScene) -> None:
         file.write(text.encode("utf-8", "replace"))
 
 
-def save_run_page(path: Path, run: Path) -> int:
+def save_run_page(path: Path | str, run: Path | str) -> int:
     """Write the page of a finished run with its input cameras and camera path, and return the number of splats."""
-    finished = open_run(run)
-    save_page(path, finished.gaussians, scene_of_run(finished))
+    finished = open_run(Path(run))
+    save_page(Path(path), finished.gaussians, scene_of_run(finished))
     return len(finished.gaussians)

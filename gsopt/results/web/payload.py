@@ -21,7 +21,7 @@ from gsopt.geometry.morton import morton_order
 
 Bytes = NDArray[np.uint8]
 LEVEL = 7
-"""Of deflate; 9 takes six times as long for 0.7 % fewer bytes of a million splats."""
+"""Deflate at level 9 takes six times as long for 0.7 % fewer bytes of a million splats."""
 
 
 @dataclass(frozen=True)

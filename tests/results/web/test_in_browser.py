@@ -113,7 +113,7 @@ def test_the_mouse_turns_and_keys_step_through_the_views(browser: Tab, run: Path
 
 
 def test_the_image_turns_while_the_worker_sorts(browser: Tab, run: Path, tmp_path: Path) -> None:
-    """The second sort of this page never ends; what is drawn follows the mouse all the same, in the first sort's order."""
+    """The second sort of this page never ends; what is drawn follows the mouse all the same."""
     text = (run / "page.html").read_text(encoding="utf-8")
     call = "const { order, n } = sorted("
     assert text.count(call) == 1
