@@ -44,22 +44,25 @@ def read(path: Path, progress: Callable[[float], None] = lambda share: None) -> 
 
 
 class Loading:
-    """One file on its way into a mesh of a scene."""
+    """Files on their way into meshes of a scene, one after the other."""
 
-    def __init__(self, path: Path, most: int, finish: Finish) -> None:
-        self.path, self.most, self.finish = path, most, finish
+    def __init__(self, paths: list[Path], most: int, finish: Finish) -> None:
+        self.paths, self.most, self.finish = paths, most, finish
+        self.path = paths[0]
         self.share = 0.0
         self.error = ""
-        self._read: tuple[list[splat_object.Part], statistics.Summary] | None = None
+        self._read: list[tuple[Path, list[splat_object.Part], statistics.Summary]] = []
         self._steps: Iterator[Any] | None = None
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def _work(self) -> None:
         try:
-            splats = read(self.path, self._tell)
-            splats = splats.at_most(self.most) if self.most else splats
-            self._read = splat_object.parts_of(splats), statistics.summary(splats)
+            for path in self.paths:
+                self.path = path
+                splats = read(path, self._tell)
+                splats = splats.at_most(self.most) if self.most else splats
+                self._read.append((path, splat_object.parts_of(splats), statistics.summary(splats)))
         except GsoptError as error:
             self.error = str(error)
         except MemoryError:
@@ -68,24 +71,26 @@ class Loading:
             self.error = f"{self.path.name} could not be read: {error!r:.200}. Please report it."
 
     def _tell(self, share: float) -> None:
-        self.share = share
+        self.share = (len(self._read) + share) / len(self.paths)
 
     def advance(self, scene: Any) -> bool:
         """Hand over for at most a slice of time; whether all is done or has failed."""
         if self._thread.is_alive():
             return False
-        if self.error or self._read is None:
+        if self.error:
             return True
         if self._steps is None:
-            self._steps = self._hand_over(scene, *self._read)
+            self._steps = self._hand_over(scene)
         until = time.perf_counter() + SLICE
         return not any(pause or time.perf_counter() > until for pause in self._steps)
 
-    def _hand_over(self, scene: Any, parts: list[splat_object.Part], summary: statistics.Summary) -> Iterator[bool]:
-        """The mesh bit by bit, then what is made of it; True where the rest is for another tick."""
-        for mesh in splat_object.mesh_in_steps(bpy, self.path.stem, parts):
-            yield False
-            if mesh is not None:
-                SUMMARIES[mesh.name] = summary
-                for _ in self.finish(scene, mesh, summary):
-                    yield True
+    def _hand_over(self, scene: Any) -> Iterator[bool]:
+        """The meshes bit by bit, then what is made of them; True where the rest is for another tick."""
+        while self._read:
+            self.path, parts, summary = self._read.pop(0)
+            for mesh in splat_object.mesh_in_steps(bpy, self.path.stem, parts):
+                yield False
+                if mesh is not None:
+                    SUMMARIES[mesh.name] = summary
+                    for _ in self.finish(scene, mesh, summary):
+                        yield True

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from .core.harmonics import C0, HARMONICS
 from .graph import Graph, Value
 
 GROUP = "gsopt splats"
@@ -20,17 +21,6 @@ MARK = "gsopt"
 """Custom property of the trees made here: their name and version."""
 DISPLAYS = ("Points", "Spheres", "Ellipsoids", "Gaussians")
 COLOR, CORNER, INSTANCED, HIDDEN = "gsopt_color", "gsopt_corner", "gsopt_instanced", "gsopt_hidden"
-
-C0 = math.sqrt(1 / math.pi) / 2
-C1 = math.sqrt(3 / math.pi) / 2
-C2_XY = math.sqrt(15 / math.pi) / 2
-C2_ZZ = math.sqrt(5 / math.pi) / 4
-C2_XX = math.sqrt(15 / math.pi) / 4
-C3_XXX = math.sqrt(35 / (2 * math.pi)) / 4
-C3_XYZ = math.sqrt(105 / math.pi) / 2
-C3_XZZ = math.sqrt(21 / (2 * math.pi)) / 4
-C3_ZZZ = math.sqrt(7 / math.pi) / 4
-C3_XXZ = math.sqrt(105 / math.pi) / 4
 
 Socket = tuple[str, str, Any, Any, Any]
 """Name, type, default, least and most."""
@@ -163,31 +153,6 @@ def band(degree: int) -> Callable[[Graph, dict[str, Value]], tuple[Value, ...]]:
         return (total,)
 
     return write
-
-
-def degree_1(x: Value, y: Value, z: Value) -> list[Value]:
-    return [y * -C1, z * C1, x * -C1]
-
-
-def degree_2(x: Value, y: Value, z: Value) -> list[Value]:
-    xx, yy, zz = x * x, y * y, z * z
-    return [x * y * C2_XY, y * z * -C2_XY, (zz * 2.0 - xx - yy) * C2_ZZ, x * z * -C2_XY, (xx - yy) * C2_XX]
-
-
-def degree_3(x: Value, y: Value, z: Value) -> list[Value]:
-    xx, yy, zz = x * x, y * y, z * z
-    return [
-        y * (xx * 3.0 - yy) * -C3_XXX,
-        x * y * z * C3_XYZ,
-        y * (zz * 4.0 - xx - yy) * -C3_XZZ,
-        z * (zz * 2.0 - xx * 3.0 - yy * 3.0) * C3_ZZZ,
-        x * (zz * 4.0 - xx - yy) * -C3_XZZ,
-        z * (xx - yy) * C3_XXZ,
-        x * (xx - yy * 3.0) * -C3_XXX,
-    ]
-
-
-HARMONICS = {1: degree_1, 2: degree_2, 3: degree_3}
 
 
 def linear(graph: Graph, given: dict[str, Value]) -> tuple[Value, ...]:

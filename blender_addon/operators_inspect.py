@@ -15,6 +15,7 @@ from . import loading, progress_timer, splat_object
 from .core import dataset, statistics
 from .core.errors import InputError, UsageError
 from .core.files import read_json
+from .core.placement import placed
 from .core.ply import write_ply
 from .core.units import meters_per_unit
 from .material import let_cycles_see_through
@@ -99,7 +100,7 @@ class GSOPT_OT_import_splats(WaitingOperator, bpy.types.Operator):
             yield
             progress_timer.undo_step("Import Splats")
 
-        progress_timer.load(scene, path, finish)
+        progress_timer.load(scene, [path], finish)
         state = settings.job_import
         self.settle(lambda: state.state == "RUNNING", lambda: settings.message if state.state == "FAILED" else "")
         return f"{path.name} imported" if self.waits else f"Reading {path.name}"
@@ -195,7 +196,7 @@ class GSOPT_OT_delete_hidden(ReportingOperator, bpy.types.Operator):
 
 
 class GSOPT_OT_export(ReportingOperator, bpy.types.Operator):
-    """Write the splats that are not hidden to a PLY, in the axes of the file they came from"""
+    """Write the splats that are not hidden to a PLY, in the axes of the file they came from, or as they are placed"""
 
     bl_idname = "gsopt.export"
     bl_label = "Export PLY"
@@ -203,6 +204,11 @@ class GSOPT_OT_export(ReportingOperator, bpy.types.Operator):
     filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})  # type: ignore[valid-type]
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    as_placed: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Blender's Axes",
+        description="Turn, move and scale them as the object is, colors too. Blender 5.3's own import turns nothing",
+        default=False,
+    )
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         self.filepath = self.filepath or "splats.ply"
@@ -210,8 +216,10 @@ class GSOPT_OT_export(ReportingOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def do(self, context: Any) -> str:
-        mesh = active_splats(context).data
-        splats = splat_object.read_mesh(mesh).rows(~splat_object.hidden(mesh))
+        thing = active_splats(context)
+        splats = splat_object.read_mesh(thing.data).rows(~splat_object.hidden(thing.data))
+        if self.as_placed:
+            splats = placed(splats, thing.matrix_world)
         path = absolute(self.filepath)
         if path.suffix.lower() != ".ply":
             path = path.with_name(f"{path.name}.ply")

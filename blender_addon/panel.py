@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from . import loading, splat_object
+from . import loading, native, splat_object
 from .panel_layout import Child, Rows, Sidebar, show_job, tell, values
 
 
@@ -233,7 +233,9 @@ class GSOPT_PT_inspect(Child, bpy.types.Panel):
         settings, layout = context.scene.gsopt, self.layout
         values(layout, settings, "display", "most_shown", "up")
         if not show_job(layout, settings.job_import, "import"):
-            layout.operator("gsopt.import_splats", icon="IMPORT")
+            row = layout.row(align=True)
+            row.operator("gsopt.import_splats", icon="IMPORT")
+            row.operator("gsopt.import_sequence", text="", icon="SEQUENCE")
         row = layout.row(align=True)
         row.operator("gsopt.import_cameras", text="Cameras", icon="OUTLINER_OB_CAMERA")
         row.operator("gsopt.look_through", text="", icon="TRIA_LEFT").step = -1
@@ -258,6 +260,8 @@ def draw_display(layout: Any, thing: Any) -> None:
     values(
         box, thing.gsopt, "display", "size", "extent", "least_opacity", "most_shown", "color_by_view", "linear_color"
     )
+    if native.kind_here():
+        box.operator("gsopt.native_splats", icon="POINTCLOUD_DATA")
 
 
 def draw_colors(layout: Any, context: Any) -> None:

@@ -210,7 +210,7 @@ def look_at_run(scene: Any) -> None:
     )
     if settings.live and run.preview not in ("", settings.run_preview) and (scene.session_uid, "live") not in _loads:
         settings.run_preview = run.preview
-        _loads[scene.session_uid, "live"] = loading.Loading(Path(run.preview), settings.live_most, show_live)
+        _loads[scene.session_uid, "live"] = loading.Loading([Path(run.preview)], settings.live_most, show_live)
 
 
 def show_live(scene: Any, mesh: Any, summary: Summary) -> Iterator[None]:
@@ -232,11 +232,11 @@ def live_object(scene: Any) -> Any:
 # Files
 
 
-def load(scene: Any, path: Path, finish: loading.Finish) -> None:
-    """Bring a file in; `finish` gets the mesh."""
+def load(scene: Any, paths: list[Path], finish: loading.Finish, most: int = 0) -> None:
+    """Bring files in, `most` splats of each where it is not 0; `finish` gets every mesh."""
     entry = scene.gsopt.job_import
-    entry.state, entry.message, entry.share = "RUNNING", path.name, 0.0
-    _loads[scene.session_uid, "import"] = loading.Loading(path, 0, finish)
+    entry.state, entry.message, entry.share = "RUNNING", paths[0].name, 0.0
+    _loads[scene.session_uid, "import"] = loading.Loading(paths, most, finish)
     watch()
 
 

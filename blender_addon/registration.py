@@ -9,6 +9,7 @@ from bpy.app.handlers import persistent
 
 from . import (
     mesh_proxy,
+    native,
     operators_camera_path,
     operators_cameras,
     operators_guidance,
@@ -22,6 +23,7 @@ from . import (
     preferences,
     progress_timer,
     properties,
+    sequence,
 )
 
 CLASSES = (
@@ -37,6 +39,8 @@ CLASSES = (
     *operators_cameras.CLASSES,
     *operators_camera_path.CLASSES,
     *operators_inspect.CLASSES,
+    *native.CLASSES,
+    *sequence.CLASSES,
     *panel.CLASSES,
 )
 

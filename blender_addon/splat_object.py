@@ -65,7 +65,14 @@ def make_mesh(bpy: Any, name: str, splats: Splats) -> Any:
     return next(step for step in mesh_in_steps(bpy, name, parts_of(splats)) if step is not None)
 
 
-KEYS = {"FLOAT": "value", "QUATERNION": "value", "BOOLEAN": "value", "FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color"}
+KEYS = {
+    "FLOAT": "value",
+    "QUATERNION": "value",
+    "BOOLEAN": "value",
+    "FLOAT_VECTOR": "vector",
+    "FLOAT_COLOR": "color",
+    "FLOAT4": "vector",
+}
 WIDTHS = {"FLOAT": 1, "QUATERNION": 4, "BOOLEAN": 1, "FLOAT_VECTOR": 3, "FLOAT_COLOR": 4}
 
 

@@ -239,6 +239,19 @@ def splats_of(run: Path) -> Path | None:
     return previews[-1] if previews else None
 
 
+def sequence_of(folder: Path) -> list[Path]:
+    """The splats to show one after the other: the previews of a run and its result, or the results of the runs in a
+    folder, by name. InputError where these are fewer than two."""
+    found = sorted(p for p in (folder / "previews").glob("step_*.ply") if not p.name.startswith("."))
+    found += [p for p in (folder / "splat.ply",) if p.is_file()]
+    if not found:
+        found = [run / "splat.ply" for run in sorted(earlier_runs(folder), key=lambda run: run.name)]
+        found = [path for path in found if path.is_file()]
+    if len(found) < 2:
+        raise InputError(f"{folder} must hold two or more splats: previews of a run, or finished runs. Choose another.")
+    return found
+
+
 def earlier_runs(parent: Path, most: int = 100) -> list[Path]:
     """Run directories in a folder, the newest first."""
     try:
