@@ -20,7 +20,7 @@ NATIVE = "gsopt_native"
 
 
 def splat_kind(cloud_type: Any) -> tuple[str, str] | None:
-    """The property of a type of point clouds, and its value, that make one splats; None where it has none."""
+    """The property of a type of point clouds, and its value, that make one splats; or None."""
     for prop in cloud_type.bl_rna.properties:
         if prop.type == "ENUM":
             found = next((item.identifier for item in prop.enum_items if "SPLAT" in item.identifier), None)
