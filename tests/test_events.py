@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsopt import events as events_module
 from gsopt.errors import InputError, UsageError
 from gsopt.events import (
     LARGEST_LOG,
@@ -17,6 +22,7 @@ from gsopt.events import (
     EventWriter,
     read_events,
     refuse_links,
+    sync_folder,
     to_json,
     write_atomic,
 )
@@ -204,3 +210,54 @@ def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
         EventWriter(tmp_path)
     assert precious.read_bytes() == b"precious"
     assert not (tmp_path / "metrics.json").is_symlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows cannot be asked for a process without harm")
+def test_the_next_writer_removes_what_a_dead_one_left_and_leaves_the_living_alone(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    left = f".metrics.json.{ended.pid}.tmp"
+    others = [f".metrics.json.{os.getppid()}.tmp", ".metrics.json.1.tmp", f".other.json.{ended.pid}.tmp"]
+    others += [".metrics.json.0.tmp", f".metrics.json.{2**31}.tmp", ".metrics.json.12a.tmp", ".metrics.json.\u0663.tmp"]
+    for name in (left, *others):
+        (tmp_path / name).write_bytes(b"half")
+    write_atomic(tmp_path / "metrics.json", b"{}")
+    assert sorted(os.listdir(tmp_path)) == sorted([*others, "metrics.json"])
+    assert (tmp_path / "metrics.json").read_bytes() == b"{}"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows flushes no folder")
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EIO])
+def test_a_folder_is_flushed_where_the_disk_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """A disk that cannot flush folders is none that broke; every descriptor is closed."""
+    flushed, closed = [], []
+    close, fsync = os.close, os.fsync
+    monkeypatch.setattr(os, "close", lambda descriptor: (closed.append(descriptor), close(descriptor)))
+    monkeypatch.setattr(
+        os, "fsync", lambda descriptor: (flushed.append(os.fstat(descriptor).st_ino), fsync(descriptor))
+    )
+    write_atomic(tmp_path / "a", b"1")
+    assert flushed[-1] == tmp_path.stat().st_ino
+    assert closed
+
+    def refuse(descriptor: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    before = len(closed)
+    with pytest.raises(OSError, match="Input/output error") if number == errno.EIO else contextlib.nullcontext():
+        sync_folder(tmp_path)
+    assert len(closed) == before + 1
+
+
+def test_a_log_of_exactly_the_largest_size_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "events.jsonl"
+    line = b'{"v": 1, "seq": 0, "kind": "a"}\n'
+    path.write_bytes(line * 3)
+    monkeypatch.setattr(events_module, "LARGEST_LOG", 3 * len(line))
+    assert len(read_events(path)[0]) == 3
+    assert read_events(path, len(line))[1] == 3 * len(line)
+    monkeypatch.setattr(events_module, "LARGEST_LOG", 3 * len(line) - 1)
+    with pytest.raises(InputError, match="MB of events"):
+        read_events(path)
+    assert len(read_events(path, len(line))[0]) == 2
