@@ -226,3 +226,66 @@ def test_a_focal_length_that_is_known_is_kept(focal: float | None, free: bool) -
 
 def test_names_are_those_of_the_photos_with_a_pose() -> None:
     assert mapping.registered(Reconstruction([3, 1], [])) == {"1.jpg", "3.jpg"} <= set(NAMES)
+
+
+@pytest.mark.parametrize(("count", "grows"), [(None, False), (3, False), (4, True)])
+def test_a_reconstruction_that_grew_by_a_photo_is_taken(
+    count: int | None, grows: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It begins from the exact points and lens, in an empty folder, and only the missing photos are matched again."""
+
+    class Written(Reconstruction):
+        def write(self, folder: Path) -> None:
+            assert list(folder.iterdir()) == []
+            (folder / "points3D.bin").touch()
+
+    verified: list[Any] = []
+    monkeypatch.setattr(few_photos, "verify", lambda project, pairs, model, only: verified.append(only))
+    found = [] if count is None else [Reconstruction(list(range(1, count + 1)), [])]
+    monkeypatch.setattr(few_photos, "_mapped", lambda project, first, start: found if first is None else [])
+    monkeypatch.setattr(few_photos, "bundle_adjusted", lambda project, model, lens: (model, lens))
+    monkeypatch.setattr(few_photos, "with_guided_matches", lambda project, pairs, model: ("guided", model))
+    project: Any = SimpleNamespace(database=tmp_path / "a.db")
+    pairs: Any = SimpleNamespace(names={1: "a", 2: "b", 3: "c", 4: "d", 5: "e"})
+    model = Written([1, 2, 3], [])
+    for _ in range(2):
+        grown: Any = few_photos._grown(project, pairs, model)
+        assert grown == (("guided", (found[0], False)) if grows else model)
+    assert verified == [{4, 5}] * 2
+
+
+@pytest.mark.parametrize(("known", "focals"), [([True, True], [None]), ([True, False], [1.2, 1.9, 0.75])])
+def test_focal_lengths_are_tried_where_one_is_not_known(known: list[bool], focals: list[float | None]) -> None:
+    class Database:
+        def __enter__(self) -> Database:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def read_all_cameras(self) -> list[Any]:
+            return [SimpleNamespace(has_prior_focal_length=one) for one in known]
+
+    project: Any = SimpleNamespace(opened=Database)
+    assert few_photos._focals(project) == focals
+
+
+def test_mapping_starts_from_the_five_best_pairs_too_and_the_best_result_is_adjusted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    counts = {(1, 2): 50, (1, 3): 90, (2, 3): 90, (1, 4): 10, (2, 4): 20, (3, 4): 70}
+    starts: list[Any] = []
+
+    def mapped(project: object, first: tuple[int, int] | None) -> list[Reconstruction]:
+        starts.append(first)
+        return [Reconstruction([1, 2, 3], shared(30 if first == (1, 2) else 20, 1, 2, 3))]
+
+    monkeypatch.setattr(few_photos, "verify", lambda project, pairs, focal: {} if focal == 1.9 else counts)
+    monkeypatch.setattr(few_photos, "_mapped", mapped)
+    monkeypatch.setattr(few_photos, "bundle_adjusted", lambda project, model, lens: (model, lens))
+    attempts = list(few_photos._attempts(None, None, "the masks", [1.2, 1.9]))  # type: ignore[arg-type]
+    assert starts == [None, (1, 3), (2, 3), (3, 4), (1, 2), (2, 4), None]
+    assert [attempt.hypothesis for attempt in attempts] == ["the masks"] * 2
+    model, lens = attempts[0].reconstruction
+    assert (len(model.all_points), lens) == (30, False)
+    monkeypatch.setattr(few_photos, "_mapped", lambda project, first: [])
+    assert list(few_photos._attempts(None, None, "", [None])) == []  # type: ignore[arg-type]
