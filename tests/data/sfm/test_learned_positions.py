@@ -1,0 +1,138 @@
+"""What surrounds the learned networks: where their features lie, what a mask keeps, and what counts as alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsopt.data.sfm import learned_features
+from gsopt.data.sfm.learned_features import LearnedFeatures, LearnedMatcher, lookalikes
+from gsopt.errors import InputError
+
+
+class WhitePixels:
+    """A network that finds the white pixels, at the centers that the real one gives: whole numbers."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[tuple[int, ...], int]] = []
+
+    def detectAndCompute(self, image: Any, most: int) -> list[dict[str, Any]]:
+        self.asked.append((tuple(image.shape), most))
+        rows, columns = torch.nonzero(image[0].mean(0) > 0.99, as_tuple=True)
+        places = torch.stack([columns, rows], dim=1).float()
+        return [{"keypoints": places, "descriptors": torch.ones(len(places), 64)}]
+
+
+def matcher() -> tuple[LearnedMatcher, WhitePixels]:
+    found = LearnedMatcher.__new__(LearnedMatcher)
+    found._extractor = network = WhitePixels()
+    return found, network
+
+
+def photo(width: int, height: int, *white: tuple[int, int]) -> np.ndarray:
+    pixels = np.zeros((height, width, 3), np.uint8)
+    for column, row in white:
+        pixels[row, column] = 255
+    return pixels
+
+
+def test_a_feature_of_a_pixel_lies_at_its_center() -> None:
+    side = learned_features.SIDE
+    found, network = matcher()
+    features = found.features(photo(side, side // 2, (0, 0), (7, 3), (side - 1, side // 2 - 1)))
+    assert features.keypoints.tolist() == [[0.5, 0.5], [7.5, 3.5], [side - 0.5, side // 2 - 0.5]]
+    assert features.size == (side, side // 2)
+    assert network.asked == [((1, 3, side // 2, side), learned_features.MAX_KEYPOINTS)]
+    assert features.descriptors.shape == (3, 64)
+
+
+def test_a_photo_is_looked_at_in_one_size_and_its_features_are_where_they_were() -> None:
+    side = learned_features.SIDE
+    pixels = np.zeros((side, 2 * side, 3), np.uint8)
+    pixels[20:40, 60:80] = 255
+    found, network = matcher()
+    features = found.features(pixels)
+    assert network.asked[0][0] == (1, 3, side // 2, side)
+    low, high = features.keypoints.min(axis=0), features.keypoints.max(axis=0)
+    assert (low >= [60, 20]).all()
+    assert (high <= [80, 40]).all()
+    assert features.keypoints.mean(axis=0).tolist() == pytest.approx([70, 30], abs=0.5)
+    thin = found.features(np.zeros((8, 3 * side, 3), np.uint8))
+    assert network.asked[1][0] == (1, 3, learned_features.STEP, side)
+    assert len(thin.keypoints) == 0
+
+
+def test_of_a_masked_photo_the_box_of_the_mask_is_looked_at_and_the_mask_kept() -> None:
+    side = learned_features.SIDE
+    mask = np.zeros((100, 200), bool)
+    mask[40:60, 100:140] = True
+    margin = round(learned_features.MARGIN * 200)
+    found, network = matcher()
+    pixels = np.zeros((100, 200, 3), np.uint8)
+    pixels[45:55, 95:130] = 255
+    features = found.features(pixels, mask)
+    width, height = 40 + 2 * margin, 20 + 2 * margin
+    assert network.asked[0][0] == (1, 3, round(height * side / width), side)
+    assert network.asked[0][1] == learned_features.CANDIDATES * learned_features.MAX_KEYPOINTS
+    columns, rows = features.keypoints.astype(int).T
+    assert mask[rows, columns].all()
+    assert (columns.min(), columns.max()) == (100, 129)
+    assert len(rows) <= learned_features.MAX_KEYPOINTS
+
+
+def test_the_box_of_a_mask_has_a_margin_and_stays_in_the_photo() -> None:
+    mask = np.zeros((100, 300), bool)
+    assert learned_features._box(mask) == (0, 0, 300, 100)
+    mask[50, 0] = mask[99, 120] = True
+    margin = round(learned_features.MARGIN * 300)
+    assert learned_features._box(mask) == (0, 50 - margin, 121 + margin, 100)
+    small = np.zeros((5, 5), bool)
+    small[2, 2] = True
+    assert learned_features._box(small) == (1, 1, 4, 4)
+
+
+def features(looks: np.ndarray) -> LearnedFeatures:
+    return LearnedFeatures(np.zeros((len(looks), 2)), looks.astype(np.float32), (9, 9))
+
+
+def test_lookalikes_are_each_others_best_and_alike() -> None:
+    basis = np.eye(64)
+    alike = learned_features.MIN_LIKENESS
+    tilted = np.cos(np.arccos(alike) - 0.01) * basis[2] + np.sin(np.arccos(alike) - 0.01) * basis[10]
+    apart = np.cos(np.arccos(alike) + 0.01) * basis[3] + np.sin(np.arccos(alike) + 0.01) * basis[11]
+    first = features(np.stack([basis[0], basis[1], tilted, apart]))
+    second = features(np.stack([basis[1], basis[0], basis[2], basis[3]]))
+    assert lookalikes(first, second) == 3
+    assert lookalikes(features(np.stack([basis[0], basis[0]])), features(basis[:1])) == 1
+    assert lookalikes(first, features(basis[:0])) == lookalikes(features(basis[:0]), first) == 0
+
+
+def test_photos_without_features_match_nothing_and_others_as_the_network_says() -> None:
+    found, _ = matcher()
+    asked: list[Any] = []
+    found._matcher = lambda pair: asked.append(pair) or {"matches": [torch.tensor([[0, 1], [2, 0]])]}
+    some, none = features(np.eye(64)[:3]), features(np.eye(64)[:0])
+    assert found.match(some, none).shape == found.match(none, some).shape == (0, 2)
+    assert asked == []
+    assert found.match(some, some).tolist() == [[0, 1], [2, 0]]
+    assert asked[0]["image0"]["keypoints"].shape == (1, 3, 2)
+    assert asked[0]["image1"]["image_size"].tolist() == [[9, 9]]
+
+
+def test_weights_of_another_content_or_size_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "xfeat.pt"
+    path.write_bytes(b"1234")
+    learned_features._check(path, "03ac674216f3e15c761ee1a5e255f067953623c8b388b4459e13f978d7c846f4")
+    with pytest.raises(InputError, match="are damaged"):
+        learned_features._check(path, "0" * 64)
+    monkeypatch.setattr(learned_features, "MAX_WEIGHT_BYTES", 4)
+    learned_features._check(path, "03ac674216f3e15c761ee1a5e255f067953623c8b388b4459e13f978d7c846f4")
+    monkeypatch.setattr(learned_features, "MAX_WEIGHT_BYTES", 3)
+    with pytest.raises(InputError, match="no file of at most"):
+        learned_features._check(path, "0" * 64)
+    with pytest.raises(InputError, match="no file of at most"):
+        learned_features._check(tmp_path / "absent.pt", "0" * 64)
