@@ -168,3 +168,32 @@ def test_masks_of_a_folder_keep_their_grays_and_masks_of_0_and_1_become_white(
     assert found.masks is not None
     with Image.open(found.masks / f"{read[0].name}.png") as mask:
         assert np.array_equal(np.asarray(mask), given * (255 if white == 1 else 1))
+
+
+@pytest.mark.parametrize("choice", ["auto", "alpha"])
+def test_alpha_becomes_masks_and_what_it_hides_becomes_gray(folder: Path, tmp_path: Path, choice: str) -> None:
+    with Image.open(folder / "room_00.jpg") as image:
+        cut = image.convert("RGBA")
+    alpha = Image.new("L", cut.size, 255)
+    alpha.paste(0, (0, 0, 100, cut.height))
+    alpha.paste(128, (100, 0, 110, cut.height))
+    cut.putalpha(alpha)
+    (folder / "room_00.jpg").unlink()
+    cut.save(folder / "room_00.png")
+    read, _ = read_photos(find_photos(folder), tmp_path)
+    (tmp_path / "work").mkdir()
+    found = prepare_masks(choice, folder, read, tmp_path / "work")
+    assert (found.kind, found.unmasked) == ("alpha", ["room_01.jpg", "room_02.jpg"])
+    assert found.masks is not None
+    assert [path.name for path in found.masks.iterdir()] == ["room_00.png.png"]
+    with Image.open(found.masks / "room_00.png.png") as mask:
+        assert np.array_equal(np.asarray(mask), np.asarray(alpha))
+    assert sorted(path.name for path in found.photos.iterdir()) == ["room_00.png", "room_01.jpg", "room_02.jpg"]
+    with Image.open(found.photos / "room_00.png") as opaque:
+        shown = np.asarray(opaque)
+    assert shown.shape[2] == 3
+    assert (shown[:, :100] == 128).all()
+    assert np.array_equal(shown[:, 110:], np.asarray(cut)[:, 110:, :3])
+    between = (np.asarray(cut)[:, 100:110, :3].astype(int) + 128) / 2
+    assert np.abs(shown[:, 100:110] - between).max() <= 2
+    assert (found.photos / "room_01.jpg").read_bytes() == (folder / "room_01.jpg").read_bytes()
