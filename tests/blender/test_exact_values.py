@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_splats import random_splats
 
-from blender_addon.core import cameras, colmap, files, splats, units
+from blender_addon.core import cameras, colmap, files, ply, splats, units
 from blender_addon.core.errors import InputError
 from blender_addon.core.statistics import Filter, bars, outliers, summary
 
@@ -260,3 +260,25 @@ def test_the_scale_of_a_ply_stands_in_its_header(tmp_path: Path) -> None:
     assert units.meters_per_unit(tmp_path / "absent.ply") == 1.0
     path.rename(tmp_path / "a.spz")
     assert units.meters_per_unit(tmp_path / "a.spz") == 1.0
+
+
+@pytest.mark.parametrize("block", [1, 3, 10, 64])
+def test_a_ply_is_the_same_whatever_the_size_of_its_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
+    cloud, shares = random_splats(10, bands=8), list[float]()
+    ply.write_ply(tmp_path / "whole.ply", cloud)
+    monkeypatch.setattr(ply, "BLOCK", block)
+    ply.write_ply(tmp_path / "blocks.ply", cloud, progress=shares.append)
+    assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    expected = [min(1.0, (i + 1) * block / 10) for i in range(-(-10 // block))]
+    assert shares == pytest.approx(expected)
+    shares.clear()
+    found = ply.read_ply(tmp_path / "whole.ply", shares.append)
+    assert shares == pytest.approx(expected)
+    for name in ("positions", "scales", "rotations", "opacities", "base", "sh"):
+        np.testing.assert_allclose(getattr(found, name), getattr(cloud, name), rtol=1e-5, atol=1e-6)
+    data = (tmp_path / "whole.ply").read_bytes()
+    (tmp_path / "cut.ply").write_bytes(data[:-1])
+    with pytest.raises(InputError, match="claims 10 rows of `vertex`"):
+        ply.read_ply(tmp_path / "cut.ply")
