@@ -34,8 +34,8 @@ NEAREST = 0.05
 """Quantile of a view's depths that counts as its nearest surfaces."""
 SEEN = 0.5
 """Weight, px, from which on a view sees a splat."""
-FOLDS = 4
-"""Shares of the input views that `left_out_change` judges one after the other."""
+LEFT_OUT_VIEWS = 8
+"""Most input views that `left_out_change` leaves out, one after the other."""
 MAX_COST = 0.02
 """dB of input-view PSNR that one rule may cost: floaters before a camera help that one camera."""
 CHECKED_VIEWS = 24
@@ -131,18 +131,16 @@ def findings(run: FinishedRun, views: Sequence[View], box: tuple[float, ...] | N
 
 @one_torch_thread()
 def left_out_change(run: FinishedRun, views: Sequence[View]) -> float:
-    """Mean change in dB that cleaning makes to views without a part in the decision, over shares of the input views.
+    """Mean change in dB of an input view when all others decide what goes; NaN where there are no others.
 
-    NaN for a single view, which leaves none to decide.
+    A view that was trained on shows splats that no other needs, so that this is more than new views lose.
     """
     changes = []
-    for fold in range(min(FOLDS, len(views)) if len(views) > 1 else 0):
-        deciding = [view for i, view in enumerate(views) if i % FOLDS != fold]
-        keep = kept(findings(run, deciding), len(run.gaussians))
-        before, after = (
-            input_psnr(run, splats, views[fold::FOLDS]) for splats in (run.gaussians, run.gaussians.select(keep))
-        )
-        changes.append(after - before)
+    for number in range(0, len(views), -(-len(views) // LEFT_OUT_VIEWS)) if len(views) > 1 else ():
+        others = [view for i, view in enumerate(views) if i != number]
+        keep = kept(findings(run, others), len(run.gaussians))
+        judged = [views[number]]
+        changes.append(input_psnr(run, run.gaussians.select(keep), judged) - input_psnr(run, run.gaussians, judged))
     return sum(changes) / len(changes) if changes else math.nan
 
 

@@ -21,7 +21,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.camera_paths import turntable_path
 from gsopt.geometry.cameras import Cameras
-from gsopt.results.clean import Finding, findings, kept, left_out_change
+from gsopt.results.clean import MAX_COST, Finding, findings, kept, left_out_change
 from gsopt.results.evaluation import evaluate, read_metrics
 from gsopt.results.finished_run import FinishedRun, draw, look_at_point, open_run, with_longest_side
 from gsopt.results.report import write_report
@@ -31,8 +31,6 @@ SPLATS, BEFORE, PICTURE = "splat.ply", "splat.before-clean.ply", "clean.png"
 METRICS, METRICS_BEFORE = "metrics.json", "metrics.before-clean.json"
 REPORT = "report.html"
 SIDE, GAP, ROWS = 360, 8, 3
-NO_LOSS = 0.001
-"""dB that count as none."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +57,11 @@ def clean(run: Path | str | FinishedRun, *, box: tuple[float, ...] | None = None
 
 
 def clean_where_it_helps(run: Path) -> tuple[Cleaning | None, float]:
-    """Clean a run that was not evaluated yet, unless views without a part in the decision lose by it: what was done,
-    or None, and the change in those views, dB."""
+    """Clean a run that was not evaluated yet, unless views without a part in the decision lose more than MAX_COST:
+    what was done, or None, and the change in those views, dB."""
     opened = open_run(run)
     change = left_out_change(opened, input_views(opened))
-    return (clean(opened) if change >= -NO_LOSS else None), change
+    return (clean(opened) if change >= -MAX_COST else None), change
 
 
 def input_views(run: FinishedRun) -> tuple[View, ...]:

@@ -67,6 +67,8 @@ def keep(name: str, found: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         libfuzzer(name, "-merge=1", scratch, str(kept), str(found))
         chosen = sorted(Path(scratch).iterdir(), key=lambda path: (path.stat().st_size, path.name))
+        if not chosen:
+            sys.exit(f"{name}: no input reached any code, so that no corpus can be chosen. Is the code instrumented?")
         size = 0
         for path in kept.iterdir():
             if not path.name.startswith("broken-"):
