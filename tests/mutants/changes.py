@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ HARMLESS_KEYWORDS = {
     "slots": "saves memory",
     "kw_only": "forbids what no code does",
     "indent": "the layout of JSON",
+    "strict": "of zip: an internal check of what this code has made equally long",
     "stacklevel": "the line that a warning names",
 }
 """Arguments whose change alters nothing that the product promises, and why."""
@@ -134,7 +136,7 @@ def _harmless(tree: ast.AST) -> Iterator[ast.AST]:
             case ast.Expr(value=ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name))) if name in HARMLESS_CALLS:
                 yield node
             case ast.Assign(targets=[ast.Name(id=name)], value=ast.Constant(value=int() | float() as value)) if (
-                name.isupper() and value >= ROUND_LIMIT and value % 50 == 0
+                name.isupper() and value >= ROUND_LIMIT and (value % 50 == 0 or math.log2(value).is_integer())
             ):
                 yield node
             case ast.If(test=test, body=body) if any(word in ast.unparse(test) for word in OTHER_PLATFORMS):

@@ -25,6 +25,7 @@ from traces import Traces
 
 TESTS = {
     "gsopt/data": "tests/data",
+    "gsopt/formats/mesh_files.py": "tests/results/mesh",
     "gsopt/formats": "tests/formats",
     "gsopt/training": "tests/training",
     "gsopt/sds": "tests/sds",

@@ -9,7 +9,16 @@ import torch
 
 from gsopt.errors import InputError
 from gsopt.sds.noise import NoiseSchedule, add_noise, x0_from
-from gsopt.sds.priors.view_conditioned import NOISE_STEPS, UNET_WIDTHS, cosine_schedule, side_multiple
+from gsopt.sds.priors.protocol import Condition
+from gsopt.sds.priors.view_conditioned import (
+    NOISE_STEPS,
+    PATCH_SIDE,
+    TOKEN_WIDTH,
+    UNET_WIDTHS,
+    TextTokens,
+    cosine_schedule,
+    side_multiple,
+)
 
 
 def test_the_cosine_schedule_is_that_of_nichol_and_dhariwal() -> None:
@@ -27,8 +36,6 @@ def test_the_cosine_schedule_is_that_of_nichol_and_dhariwal() -> None:
 
 
 def test_an_image_side_is_a_multiple_of_a_patch_halved_between_levels() -> None:
-    from gsopt.sds.priors.view_conditioned import PATCH_SIDE
-
     side = side_multiple()
     for _ in UNET_WIDTHS[1:]:
         assert side % 2 == 0
@@ -74,3 +81,17 @@ def test_each_kind_of_prediction_gives_back_the_image() -> None:
     v = signal**0.5 * eps - (1 - signal) ** 0.5 * x0
     for prediction, output in (("sample", x0), ("epsilon", eps), ("v_prediction", v)):
         torch.testing.assert_close(x0_from(output, x_t, signal, prediction), x0)  # type: ignore[arg-type]
+
+
+def test_rows_of_tokens_are_padded_to_the_longest() -> None:
+    first, second = torch.ones(3, TOKEN_WIDTH), 2 * torch.ones(5, TOKEN_WIDTH)
+    found = TextTokens.from_conditions([Condition(tokens=first), Condition(), Condition(tokens=second)])
+    assert found.tokens.shape == (3, 5, TOKEN_WIDTH)
+    assert found.mask.tolist() == [[True] * 3 + [False] * 2, [True] + [False] * 4, [True] * 5]
+    assert torch.equal(found.tokens[0, :3], first)
+    assert torch.equal(found.tokens[2], second)
+    assert not found.tokens[1].any()
+    empty = TextTokens.empty(2)
+    assert (empty.tokens.shape, empty.mask.shape) == ((2, 1, TOKEN_WIDTH), (2, 1))
+    assert empty.mask.all()
+    assert not empty.tokens.any()

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from tiny_scenes import cloud, tiny_config
 
@@ -13,7 +14,7 @@ from gsopt.config.train import ExposureConfig, SparseConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.raster.backend import RasterSettings, RenderedFrame
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.training.exposure import BETA1, Exposure
+from gsopt.training.exposure import BETA1, BETA2, EPS, Exposure
 from gsopt.training.loop import train
 
 WHITE = torch.ones(3)
@@ -90,3 +91,32 @@ def test_photos_are_taken_as_they_are_until_start_and_without_the_flag(dataset: 
     assert all(view["gains"] == [1.0, 1.0, 1.0] for view in views)
     train(replace(base, exposure=ExposureConfig(learn=True, start=0)), tmp_path / "on")
     assert (tmp_path / "off/splat.ply").read_bytes() != (tmp_path / "on/splat.ply").read_bytes()
+
+
+def test_gains_take_adams_steps_at_a_rate_that_falls_by_the_same_factor(dataset: Path) -> None:
+    scene = load_scene(dataset)
+    config = ExposureConfig(learn=True, start=10, lr=1e-2, lr_final=1e-4)
+    found = Exposure(config, scene, 110)
+    assert [found.rate(step) for step in (10, 60, 110)] == pytest.approx([1e-2, 1e-3, 1e-4])
+    assert Exposure(config, scene, 10).rate(10) == pytest.approx(1e-2)
+    own = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    adam = torch.optim.Adam([own], lr=1.0, betas=(BETA1, BETA2), eps=EPS)
+    expected = torch.zeros(len(scene.train), 3, dtype=torch.float64)
+    random = torch.Generator().manual_seed(0)
+    for step in (9, 10, 11, 12, 50):
+        gradient = torch.randn(3, dtype=torch.float64, generator=random)
+        before = own.detach().clone()
+        found._update(1, step, gradient)
+        if step > 10:
+            own.grad = gradient
+            adam.step()
+            expected[1] += found.rate(step) * (own.detach() - before)
+            expected -= expected.mean(0)
+        torch.testing.assert_close(found.log_gains, expected)
+    record = found.record()
+    assert record["version"] == 1
+    assert [view["name"] for view in record["views"]] == [view.name for view in scene.train]
+    assert record["views"][1]["gains"] == pytest.approx(expected[1].exp().tolist())
+    again = Exposure(config, scene, 110)
+    again.restore(found.tensors())
+    assert all(torch.equal(a, b) for a, b in zip(again.tensors().values(), found.tensors().values(), strict=True))
