@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from blender_addon.core import arguments
+from blender_addon.core import arguments, prompts
 from blender_addon.core.errors import InputError
 from blender_addon.core.prompts import Document, Prompt, read_prompts, write_prompts
 
@@ -211,3 +213,20 @@ def test_synth_views_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (settings.views, settings.test_views, settings.resolution, settings.masks) == (3, 1, (32, 32), True)
     plain = arguments.render("", "python", Path("s.py"), tmp_path / "a.glb", tmp_path / "out", rendering)
     assert synth_views.own_arguments(plain[1:]) == synth_views.own_arguments(words)
+
+
+@pytest.mark.parametrize(
+    ("name", "fine", "refused"),
+    [
+        ("score", (-1.0, 1.0, None, 0), (-1.001, 1.001, math.nan)),
+        ("weight", (0.0, prompts.LARGEST_WEIGHT, 1), (-0.001, prompts.LARGEST_WEIGHT * 1.001, math.inf)),
+        ("text", ("a", "a" * prompts.LONGEST_TEXT), ("", " ", "a" * (prompts.LONGEST_TEXT + 1))),
+        ("rationale", ("", "a" * prompts.LONGEST_RATIONALE), ("a" * (prompts.LONGEST_RATIONALE + 1), 3)),
+    ],
+)
+def test_values_of_a_prompt_may_be_their_bounds(name: str, fine: tuple[Any, ...], refused: tuple[Any, ...]) -> None:
+    for value in fine:
+        assert getattr(prompts.Prompt(**{"text": "a", name: value}), name) == value
+    for value in refused:
+        with pytest.raises(InputError):
+            prompts.Prompt(**{"text": "a", name: value})
