@@ -17,6 +17,7 @@ from gsopt.data.scene import load_scene
 from gsopt.errors import InputError, UsageError
 from gsopt.formats.ply import save_ply
 from gsopt.raster.api import make_backend
+from gsopt.training.cells import divide as divide_module
 from gsopt.training.cells.divide import divide, ground_axes, relevant, split
 from gsopt.training.cells.plan import Cell, CellPlan, read_plan, sha256
 from gsopt.training.cells.size import cell_sizes
@@ -144,3 +145,40 @@ def test_cells_that_do_not_fit_are_refused_with_what_would(data: Path) -> None:
     assert sizes(replace(huge, cells="auto", max_memory="9GB")).count == 2
     with pytest.raises(InputError, match="fewer Gaussians"):
         sizes(replace(huge, cells="auto", max_memory="350MB"))
+
+
+def test_the_wider_axis_is_cut_whatever_a_few_lie_out_there() -> None:
+    """10 times as wide along x; two places in a hundred lie a thousand times farther out along y."""
+    places = torch.rand(200, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    places[:, 0] *= 10
+    places[:2, 1], places[2:4, 1] = 1e3, -1e3
+    (low, high), (next_low, next_high) = split(places, 2)
+    assert low == (-math.inf, -math.inf)
+    assert high[1] == next_high[1] == math.inf
+    assert high[0] == next_low[0] == pytest.approx(float(places[:, 0].median()), abs=0.2)
+    turned = split(places.flip(1), 2)
+    assert turned[0][1] == (math.inf, high[0])
+    assert turned[1][0] == (-math.inf, high[0])
+    three = split(places, 3)
+    held = [int(((places >= torch.tensor(a)) & (places < torch.tensor(b))).all(1).sum()) for a, b in three]
+    assert held == [66, 67, 67]
+
+
+def test_the_ground_is_at_right_angles_to_the_cameras_common_up(data: Path) -> None:
+    axes = ground_axes(load_scene(data).train)
+    torch.testing.assert_close(axes @ axes.T, torch.eye(2, dtype=torch.float64), atol=1e-6, rtol=0)
+    assert float(axes[:, 2].abs().max()) < 0.05  # the cameras of this scene have z up
+    assert float(axes[0].abs().max()) > 0.99
+
+
+def test_a_cell_draws_its_share_of_what_a_view_shows() -> None:
+    weights, wide = torch.tensor([1.0, 3.0, 4.0]), torch.tensor([[True, False, True], [False, True, False]])
+    assert divide_module._shares(weights, wide).tolist() == pytest.approx([5 / 8, 3 / 8])
+    assert divide_module._shares(torch.zeros(3), wide).tolist() == [0, 0]
+
+
+def test_a_view_with_exactly_the_relevant_share_belongs_to_a_cell() -> None:
+    shares = torch.full((20,), float(divide_module.RELEVANT))
+    assert relevant(shares).all()
+    most = torch.cat([torch.full((divide_module.FEWEST_VIEWS,), 0.5), torch.full((9,), 0.01)])
+    assert relevant(most).sum() == divide_module.FEWEST_VIEWS
