@@ -6,6 +6,7 @@ every fault, or, for a work of many calls, with one of the faults in turn.
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.skipif(compiler() is None, reason="needs Linux and a C 
 SAMPLED = 12
 """Calls at which a work is made to fail in an ordinary run."""
 MANY_CALLS = 300
-"""From here on each call meets one fault."""
+"""From here on, and where a child takes part, each call meets one fault."""
 FULL = os.environ.get("GSOPT_EVERY_WRITE") == "full"
 CHECKPOINT_EVERY = 7
 Files = dict[str, bytes]
@@ -90,11 +91,19 @@ def whole_or_absent(folder: Path) -> None:
     assert not (folder / "scene").exists() or (folder / "scene" / "sfm.json").exists()
 
 
+def figures(folder: Path) -> Files:
+    """What a suite measured, without times and memory."""
+    document = json.loads((folder / "found.json").read_text()) if (folder / "found.json").exists() else {"runs": []}
+    kept = ("arm", "seed", "mean", "per_view", "n_gaussians")
+    return {run["scene"]: json.dumps([run[name] for name in kept]).encode() for run in document["runs"]}
+
+
 def works(inputs: Path) -> dict[str, Work]:
     scenes, photos, splats = inputs / "scenes", inputs / "photos", inputs / "splats.ply"
     sfm = shlex.split("--features sift --max-features 250 --max-size 200 --threads 1")
     finetune = shlex.split("--val two --fits 1 --size 64 --steps 2 --batch 2 --threads 1")
     train = shlex.split("--init random --init-count 60 --iterations 20 --preview-every 5 --lambda-sds 0 --threads 1")
+    suite = ["--suite", str(inputs / "one.toml"), "--root", str(scenes), "--seeds", "1"]
     train += ["--checkpoint-every", str(CHECKPOINT_EVERY)]
     return {
         "train": Work(
@@ -128,10 +137,32 @@ def works(inputs: Path) -> dict[str, Work]:
             nothing,
             slow=True,
         ),
+        "suite": Work(
+            lambda folder: ["bench", *suite, "-o", str(folder / "found.json")],
+            same_command,
+            figures,
+            nothing,
+            nothing,
+            slow=True,
+            has_child=True,
+        ),
     }
 
 
-NAMES = ("train", "export", "sfm", "finetune")
+NAMES = ("train", "export", "sfm", "finetune", "suite")
+SUITE = """
+title = "One"
+about = "One run."
+[[groups]]
+name = "tiny"
+title = "Tiny"
+why = "Too short."
+scenes = ["one"]
+views = [4]
+runs = ["ours-0 12"]
+flags = ["--init", "random", "--init-count", "60", "--lambda-sds", "0"]
+get = "Made here."
+"""
 
 
 @pytest.fixture(scope="module")
@@ -148,12 +179,13 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if FULL:
         write_dataset(folder / "scenes" / "two", train=6)
         room.photograph(folder / "photos", room.arc(3, spread=14.0))
+        (folder / "one.toml").write_text(SUITE)
     return folder
 
 
-def faults_of(calls: int) -> Iterator[tuple[int, Fault]]:
+def faults_of(calls: int, in_turn: bool) -> Iterator[tuple[int, Fault]]:
     """Pairs of a call and a fault: all of them, or a sample in which every fault occurs."""
-    if FULL and calls >= MANY_CALLS:  # the second term: programs repeat themselves every few calls
+    if FULL and (in_turn or calls >= MANY_CALLS):  # the second term: programs repeat themselves every few calls
         yield from ((at, FAULTS[(at + at // len(FAULTS)) % len(FAULTS)]) for at in range(1, calls + 1))
     elif FULL:
         yield from ((at, fault) for at in range(1, calls + 1) for fault in FAULTS)
@@ -172,7 +204,7 @@ def test_the_work_survives_a_fault_at_any_write(name: str, disk: FaultyDisk, inp
     assert healthy.code == 0, disk.log.read_text()
     assert healthy.calls > 3
     products = work.products(whole_folder)
-    cases, defects = list(faults_of(healthy.calls)), []
+    cases, defects = list(faults_of(healthy.calls, work.has_child)), []
     for at, fault in cases:
         try:
             survives(work, disk, fault, at, fresh(tmp_path / "faulty", work), products)

@@ -10,18 +10,26 @@ import importlib
 import json
 import os
 import signal
+import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any, NoReturn, Self
 
 import torch
 
 import gsopt.cli.train  # noqa: F401 (jobs would import it anew)
+from gsopt.benchmark.suite import single_run
+from gsopt.benchmark.suite.single_run import RunFailed
 from gsopt.cli import main
 from gsopt.config.train import InitConfig, SparseConfig, TrainConfig
 from gsopt.data.sfm import child_process
+from gsopt.errors import GsoptError
+from gsopt.farm import open as open_farm
+from gsopt.farm.job import Job, Outcome
 from gsopt.finetune import evaluation, reconstruction_pairs
 from gsopt.sds.priors import view_conditioned
 
@@ -74,6 +82,34 @@ class ForkedChild:
             os.kill(self.pid, signal.SIGKILL)
 
 
+class ForkFarm:
+    """Takes the place of the farm of `gsopt bench --suite`: a fork for every run, so that torch is imported once."""
+
+    def run(self, jobs: list[Job], report: Any = None) -> Iterator[Outcome]:
+        for job in jobs:
+            reader, writer = os.pipe()
+            child = os.fork()
+            if child == 0:
+                try:
+                    with open(writer, "w") as file:
+                        json.dump(answer_of(job), file)
+                finally:
+                    os._exit(0)
+            os.close(writer)
+            with open(reader) as file:
+                answer = json.loads(file.read() or '{"failed": "it died"}')
+            os.waitpid(child, 0)
+            failed = answer.get("failed")
+            yield Outcome(job, "failed", error=failed) if failed else Outcome(job, "done", answer)
+
+
+def answer_of(job: Job) -> dict[str, Any]:
+    try:
+        return single_run.answer(job.request)
+    except (RunFailed, GsoptError) as error:
+        return {"failed": str(error)}
+
+
 KINDS = ("none", "kill", "fail once", "fail from here", "short")
 LONGEST_SECONDS = 900
 """A run takes seconds, or minutes on a machine with much else to do."""
@@ -90,7 +126,8 @@ def prepare() -> None:
         view_conditioned.make_unet(0)  # imports diffusers, for seconds
         importlib.import_module("gsopt.data.sfm.pipeline")
         importlib.import_module("pycolmap")
-        child_process.subprocess.Popen = ForkedChild
+        open_farm.open_farm = lambda *_: ForkFarm()
+        child_process.subprocess = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedChild})
 
 
 def run(job: dict[str, Any], faults: ctypes.CDLL) -> NoReturn:

@@ -289,3 +289,64 @@ def test_mapping_starts_from_the_five_best_pairs_too_and_the_best_result_is_adju
     assert (len(model.all_points), lens) == (30, False)
     monkeypatch.setattr(few_photos, "_mapped", lambda project, first: [])
     assert list(few_photos._attempts(None, None, "", [None])) == []  # type: ignore[arg-type]
+
+
+class Pairs:
+    """The part of COLMAP's database that holds the geometry of pairs."""
+
+    def __init__(self) -> None:
+        self.geometries: dict[tuple[int, int], Any] = {(1, 9): "old"}
+
+    def __enter__(self) -> Pairs:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def clear_two_view_geometries(self) -> None:
+        self.geometries.clear()
+
+    def read_all_images(self) -> list[Any]:
+        return [SimpleNamespace(image_id=i, camera_id=1) for i in (1, 2, 3)]
+
+    def exists_two_view_geometry(self, a: int, b: int) -> bool:
+        return (a, b) in self.geometries
+
+    def delete_two_view_geometry(self, a: int, b: int) -> None:
+        del self.geometries[a, b]
+
+    def write_two_view_geometry(self, a: int, b: int, found: Any) -> None:
+        assert (a, b) not in self.geometries, "COLMAP refuses a second one"
+        self.geometries[a, b] = found
+
+
+@pytest.mark.parametrize("features", ["sift", "both"])
+def test_pairs_are_kept_with_enough_in_common_and_where_their_turn_agrees(
+    features: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """17 of 18 features do not suffice; of learned features a pair that turns otherwise goes again."""
+    counts = {(1, 2): 18, (1, 3): 30, (2, 3): 17}
+
+    def geometry(first: Any, points: Any, second: Any, others: Any, rows: Any, options: Any) -> Any:
+        pose = SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: "turn"))
+        return SimpleNamespace(inlier_matches=rows[: options.min_num_inliers + 12], cam2_from_cam1=pose)
+
+    options = SimpleNamespace(ransac=SimpleNamespace())
+    colmap = SimpleNamespace(TwoViewGeometryOptions=lambda: options, estimate_calibrated_two_view_geometry=geometry)
+    database, asked = Pairs(), []
+    monkeypatch.setattr(few_photos, "_lenses", lambda *_: {1: "lens"})
+    monkeypatch.setattr(few_photos, "disagreeing", lambda *found: asked.append(found) or [(1, 3)])
+    project: Any = SimpleNamespace(pycolmap=colmap, config=SfmConfig(features=features), opened=lambda: database)
+    matches = {pair: [0] * count for pair, count in counts.items()}
+    pairs: Any = SimpleNamespace(matches=matches, keypoints={1: "a", 2: "b", 3: "c"}, turntable=True)
+    learned = features == "both"
+    found = few_photos.verify(project, pairs)
+    assert found == ({(1, 2): 18} if learned else {(1, 2): 18, (1, 3): 30})
+    assert database.geometries.keys() == found.keys()
+    assert len(asked) == learned
+    assert not learned or asked[0][2] == few_photos.MIN_TURN
+    assert (options.compute_relative_pose, options.detect_watermark, options.ransac.random_seed) == (True, False, 0)
+    database.geometries[1, 2] = "before"
+    only = few_photos.verify(project, pairs, only={2})
+    assert only == {(1, 2): 18}
+    assert database.geometries.keys() == found.keys()
+    assert database.geometries[1, 2] != "before"
