@@ -72,6 +72,8 @@ class Bench:
         """Until the device has done what it was given."""
         if self.backend.device.type == "cuda":
             torch.cuda.synchronize(self.backend.device)
+        if self.backend.device.type == "mps":
+            torch.mps.synchronize()
 
     def forget_peak(self) -> None:
         """Begin to watch torch's memory anew."""
@@ -80,7 +82,7 @@ class Bench:
             torch.cuda.reset_peak_memory_stats(self.backend.device)
 
     def peak(self) -> int:
-        """Most bytes that torch held since; 0 on a CPU."""
+        """Most bytes that torch held since; 0 on a CPU and on Apple's GPU, which does not count them."""
         return torch.cuda.max_memory_allocated(self.backend.device) if self.backend.device.type == "cuda" else 0
 
     def seconds(self, work: Callable[[], object], repetitions: int) -> float:
@@ -288,9 +290,9 @@ def open_backend(tiny: bool) -> DeviceBackend:
         from simt_runtime import SimtRuntime
 
         return DeviceBackend(SimtRuntime())
-    from gsopt.raster.device.gpu import gpu_runtime
+    from gsopt.raster.device.gpus import open_runtime, seen
 
-    return DeviceBackend(gpu_runtime())
+    return DeviceBackend(open_runtime(seen() or "cuda"))
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MAX_THREADS = 1024
 UNITS = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}
-DEVICE = re.compile(r"(?:(cpu|cuda)(?::\d{1,3})?)?")
+DEVICE = re.compile(r"(?:(cpu|cuda|mps)(?::\d{1,3})?)?")
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ def _broken(hint: Any, value: Any) -> str:
 
 
 def device(value: object) -> str:
-    """The kind of a device: "cpu", "cuda", or empty where it is left open. Raises SettingError for anything else."""
+    """The kind of a device: "cpu", "cuda", "mps", or empty where it is open. Raises SettingError for anything else."""
     match = DEVICE.fullmatch(value) if isinstance(value, str) else None
     if match is None:
-        raise SettingError(f"`device` must be cpu, cuda or a GPU as cuda:1, got {shortened(value)}. Leave it out.")
+        raise SettingError(f"`device` must be cpu, cuda, mps or a GPU as cuda:1, got {shortened(value)}. Leave it out.")
     return match[1] or ""
 
 

@@ -1,25 +1,41 @@
-"""A GPU for tests of code that only a GPU would run: tensors that say they lie on cuda:0 and whose numbers lie here.
+"""A GPU for tests of code that only a GPU would run: tensors that say they lie there and whose numbers lie here.
 
-As on a real one, an operation on tensors of both places raises RuntimeError, and a generator of the other place too.
+As on a real one, an operation on tensors of both places raises RuntimeError, and a generator of the other place too;
+one of Apple has no float64 and not every operation. What goes to and fro is counted.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import torchgen
+import yaml
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 GPU = torch.device("cuda", 0)
+APPLE = torch.device("mps", 0)
 GENERATORS: set[int] = set()
 """Addresses of the generators there: an operation sees no more of them."""
 # Operations that may take tensors of both places: copies, and rows named by numbers of the other place.
 MIXED = ("aten::_to_copy", "aten::copy_", "aten::index", "aten::index_put_")
+
+
+class Place:
+    """Where the pretended tensors lie."""
+
+    device = GPU
+    current = 0
+    """torch's current GPU, which "cuda" without a number means."""
+    crossings: list[int]
+    """How many numbers went to the GPU or came from it, copy by copy."""
 
 
 class There(Tensor):
@@ -49,7 +65,7 @@ class There(Tensor):
     @property
     def device(self) -> torch.device:
         """The pretended one."""
-        return GPU
+        return Place.device
 
     def data_ptr(self) -> int:
         """The kernels' address."""
@@ -57,6 +73,7 @@ class There(Tensor):
 
     def tolist(self) -> Any:
         """The numbers, copied to Python."""
+        Place.crossings.append(self.numel())
         return self.inner.tolist()
 
     def __repr__(self, **_: Any) -> str:
@@ -73,8 +90,21 @@ class Generator(torch.Generator):
 
     def __new__(cls, device: Any = "cpu") -> Generator:
         made = super().__new__(cls)
-        (GENERATORS.add if torch.device(device).type == "cuda" else GENERATORS.discard)(made._cdata)
+        (GENERATORS.add if is_there(device) else GENERATORS.discard)(made._cdata)
         return made
+
+
+def is_there(device: Any) -> bool:
+    """Whether this is the pretended GPU. Raises RuntimeError for another GPU."""
+    wanted = torch.device(device)
+    if wanted.type in ("cpu", "meta"):
+        return wanted.type == "meta"
+    index = Place.current if wanted.index is None else wanted.index
+    if (wanted.type, index) != (Place.device.type, Place.device.index):
+        raise RuntimeError(
+            f"expected all tensors to be on the same device, got {Place.device} and {wanted.type}:{index}"
+        )
+    return True
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
@@ -85,18 +115,23 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if not there and "device" not in kwargs:
         return func(*args, **kwargs)
     if there and here and name not in MIXED:
-        raise RuntimeError(f"{name}: expected all tensors to be on the same device, got cuda:0 and cpu")
+        raise RuntimeError(f"{name}: expected all tensors to be on the same device, got {Place.device} and cpu")
     device = kwargs.get("device")
-    to_there = bool(there) if device is None else torch.device(device).type in ("cuda", "meta")
+    to_there = bool(there) if device is None else is_there(device)
     generator = kwargs.get("generator")
     if generator is not None and to_there != (generator._cdata in GENERATORS):
-        raise RuntimeError(f"{name}: expected a {'cuda' if to_there else 'cpu'} device type for generator")
+        raise RuntimeError(f"{name}: expected a {Place.device.type if to_there else 'cpu'} device type for generator")
     if device is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
     if name == "aten::copy_":
         to_there = isinstance(args[0], There)
+    crossing = sum(leaf.numel() for leaf in flat if isinstance(leaf, There) != to_there)
+    if crossing or name == "aten::_local_scalar_dense":
+        Place.crossings.append(crossing or 1)
     args, kwargs = tree_map(lambda leaf: leaf.inner if isinstance(leaf, There) else leaf, (args, kwargs))
     out = func(*args, **kwargs)
+    if to_there and Place.device.type == "mps":
+        _require_metal(func, out)
     if func._schema.name.endswith("_") and flat:
         return flat[0]
     if to_there and not device and name == "aten::_local_scalar_dense":
@@ -104,11 +139,51 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return tree_map(lambda leaf: There(leaf) if isinstance(leaf, Tensor) else leaf, out) if to_there else out
 
 
+def _require_metal(func: Any, out: Any) -> None:
+    """Raises what torch raises on Apple's GPU."""
+    if any(
+        leaf.dtype in (torch.float64, torch.complex128) for leaf in tree_flatten(out)[0] if isinstance(leaf, Tensor)
+    ):
+        raise TypeError(
+            f"{func}: Cannot convert a MPS Tensor to float64 dtype as the MPS framework doesn't support float64."
+        )
+    if str(func._schema.name).removeprefix("aten::") + "." + func._overloadname not in metal_operations():
+        raise NotImplementedError(f"The operator {func} is not currently implemented for the MPS device.")
+
+
+@functools.cache
+def metal_operations() -> set[str]:
+    """`name.overload` of all that torch has for Apple's GPU, from the table that torch is built of."""
+    table = Path(torchgen.__file__).parent / "packaged" / "ATen" / "native" / "native_functions.yaml"
+    rows = {}
+    for row in yaml.load(table.read_text(), Loader=yaml.CSafeLoader):
+        name, _, overload = row["func"].partition("(")[0].partition(".")
+        rows[f"{name}.{overload or 'default'}"] = row
+    return {name for name, row in rows.items() if _has_metal(row, rows)}
+
+
+def _has_metal(row: dict[str, Any], rows: dict[str, Any]) -> bool:
+    if "structured_delegate" in row:
+        return _has_metal(rows[row["structured_delegate"]], rows)
+    keys = {key.strip() for key_list in row.get("dispatch", {"Composite": ""}) for key in key_list.split(",")}
+    return any(key == "MPS" or key.startswith("Composite") for key in keys)
+
+
 @contextmanager
-def pretend_gpu() -> Iterator[torch.device]:
-    """Tensors can be made on cuda:0, and are moved there and back."""
+def _made_current(device: Any) -> Iterator[None]:
+    before, wanted = Place.current, torch.device(device)
+    Place.current = before if wanted.index is None else wanted.index
+    yield
+    Place.current = before
+
+
+@contextmanager
+def pretend_gpu(place: torch.device = GPU) -> Iterator[torch.device]:
+    """Tensors can be made on `place`, and are moved there and back."""
+    Place.device, Place.current, Place.crossings = place, 0, []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torch.cuda._lazy_init", lambda: None)
+        patch.setattr("torch.cuda.device", _made_current)
         patch.setattr("torch.Generator", Generator)
         with _Mode():
-            yield GPU
+            yield place

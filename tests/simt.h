@@ -20,12 +20,15 @@
   static void name##_block(const Arguments& a)
 #define PHASE(t) for (int t##_at = 0, t = simt.order[0]; t##_at < kThreads; t = simt.order[++t##_at])
 #define SHARED
+#define GLOBAL
+#define IN_BLOCK
 #define NOT_INLINED __attribute__((noinline))
 
 namespace gsopt::GSOPT_ISA {
 
 using Index = long long;
 constexpr int kThreads = 256;
+constexpr int kBatch = 16;
 
 // In which order a processor takes the threads of a block, and the blocks.
 struct Order {
@@ -43,7 +46,7 @@ template <class T> struct Own {
   T value[kThreads];
   T& operator[](int t) { return value[t]; }
 };
-inline bool all_threads(const Own<bool>& own) {
+inline bool all_threads(const Own<bool>& own, int*) {
   for (bool mine : own.value)
     if (!mine) return false;
   return true;

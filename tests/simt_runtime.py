@@ -8,12 +8,15 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from gsopt.raster.device.backend import DeviceBackend
+from gsopt.raster.device.layout import filled, kernels
 from gsopt.raster.device.runtime import THREADS
 from gsopt.raster.device.source import program
 
@@ -66,10 +69,14 @@ class SimtRuntime:
         self._order = Order.of(lockstep, backwards)
         self._library = library()
 
-    def launch(self, kernel: str, blocks: int, arguments: ctypes.Structure) -> None:
+    def launch(self, kernel: str, blocks: int, arguments: Mapping[str, Any]) -> None:
         """Run a kernel to its end."""
+        self.run(kernel, blocks, filled(kernels(program())[kernel], arguments))
+
+    def run(self, kernel: str, blocks: int, record: ctypes.Structure) -> None:
+        """The same with a record of addresses."""
         run = getattr(self._library, f"run_{kernel}")
-        run(ctypes.byref(arguments), ctypes.c_int32(blocks), ctypes.byref(self._order))
+        run(ctypes.byref(record), ctypes.c_int32(blocks), ctypes.byref(self._order))
 
     def size_of(self, kernel: str) -> int:
         """Bytes of the kernel's record, as its compiler has it."""

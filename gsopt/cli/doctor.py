@@ -60,7 +60,7 @@ class Rasterizer:
 
 @dataclass(frozen=True)
 class Gpu:
-    """The GPU that `--backend cuda` takes, or why there is none."""
+    """The GPU that `--backend auto` takes, or why there is none."""
 
     device: str | None
     arch: str | None
@@ -141,10 +141,9 @@ def examine_rasterizer() -> Rasterizer:
 def examine_gpu() -> Gpu:
     """Compile the kernels for torch's GPU and time them."""
     try:
-        from gsopt.raster.device.backend import DeviceBackend
-        from gsopt.raster.device.gpu import gpu_runtime
+        from gsopt.raster.device.gpus import open_gpu, seen
 
-        backend = DeviceBackend(gpu_runtime())
+        backend = open_gpu(seen() or ("mps" if sys.platform == "darwin" else "cuda"))
         about = backend.runtime.about
         seconds = float(about["compile_seconds"])
         return Gpu(about["device"], about["arch"], about["library"], seconds, measure(backend), None)

@@ -21,7 +21,7 @@ class Flags:
     """Also compute LPIPS (VGG), at many times the cost of the rest; needs its weights."""
     report: bool = True
     """Write report.html anew with these figures."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
+    backend: Literal["auto", "cpu", "cuda", "mps", "reference"] | None = None
     """Draw with this backend instead of the run's."""
     threads: int | None = None
     """Draw with this many threads instead of the run's; 0 = one per core."""

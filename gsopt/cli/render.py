@@ -39,7 +39,7 @@ class Flags:
     """Scale the frames so that the longer side has this many pixels."""
     overwrite: bool = False
     """Replace files that exist."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
+    backend: Literal["auto", "cpu", "cuda", "mps", "reference"] | None = None
     """Draw with this backend instead of the run's."""
     threads: int | None = None
     """Draw with this many threads instead of the run's; 0 = one per core."""

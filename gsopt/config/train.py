@@ -299,11 +299,11 @@ class TrainConfig:
     """Training steps; those of the preset by default, then with few views at most `sparse.steps_per_view` for each."""
     seed: Annotated[int, Within(0, 2**31 - 1)] = 0
     """Seed of every random number: same seed, same data, same bits."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
-    """Rasterizer: cuda on a GPU, cpu on this processor; auto takes the GPU where torch finds one. reference is plain
-    torch, a slow oracle for tiny scenes."""
+    backend: Literal["auto", "cpu", "cuda", "mps", "reference"] = "auto"
+    """Rasterizer: cuda on a GPU of NVIDIA or AMD, mps on one of Apple, cpu on this processor; auto takes the GPU where
+    torch finds one. reference is plain torch, a slow oracle for tiny scenes."""
     device: str = ""
-    """GPU to take, as cuda:1, or cpu; left open, torch's current GPU."""
+    """GPU to take, as cuda:1 or mps, or cpu; left open, torch's current GPU."""
     threads: Threads = 0
     """Number of threads, 0 = one per core. The result does not depend on it."""
     max_memory: str = ""

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gsopt.geometry.precision import in_float64
+
 BITS = 21
 """Per axis: three axes fill 63 bits."""
 # Each step moves the upper half of the bits up, until two zeros stand between any two.
@@ -24,9 +26,9 @@ def morton_order(points: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
     if len(points) == 0:
         return torch.empty(0, dtype=torch.int64, device=points.device)
     low, high = points.amin(dim=0), points.amax(dim=0)
-    cells = (points - low).double() / (high - low).double().clamp_min(1e-30) * (2**BITS - 1)
+    cells = in_float64(points - low) / in_float64(high - low).clamp_min(1e-30) * (2**BITS - 1)
     x, y, z = (_spread(axis) for axis in cells.to(torch.int64).unbind(-1))
-    return torch.argsort(x | (y << 1) | (z << 2), stable=True)
+    return torch.argsort(x | (y << 1) | (z << 2), stable=True).to(points.device)
 
 
 def _spread(values: Int[Tensor, "N"]) -> Int[Tensor, "N"]:

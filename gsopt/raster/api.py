@@ -10,14 +10,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gsopt import check
-from gsopt.errors import InputError, MissingDependency
+from gsopt.errors import InputError, MissingDependency, UsageError
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster.autograd import draw
 from gsopt.raster.backend import Backend, RasterSettings, enough_memory
 
-BACKENDS = ("auto", "cpu", "cuda", "reference")
-DEVICES = ("cpu", "cuda")
+BACKENDS = ("auto", "cpu", "cuda", "mps", "reference")
+GPUS = ("cuda", "mps")
+DEVICES = ("cpu", *GPUS)
 FLOAT32_MAX = torch.finfo(torch.float32).max
 MAX_SIDE = 1 << 24
 """Width and height of an image, px: beyond, float32 misses pixels."""
@@ -93,19 +94,20 @@ def expected_depth(depths: Float[Tensor, "*C H W"], alphas: Float[Tensor, "*C H 
 
 
 def make_backend(name: str = "auto", threads: int = 0, device: str = "") -> Backend:
-    """The backend of that name. "auto" is "cuda" where torch finds a GPU, else "cpu", never the slow reference.
+    """The backend of that name. "auto": "cuda" or "mps" where torch finds a GPU, else "cpu", never the slow reference.
 
-    `device`: "cpu", "cuda" or a certain GPU, as "cuda:1"; it decides for "auto". Raises UsageError for an unknown name,
-    MissingDependency, with what to install, for a GPU that cannot be used and for an extension that is not built.
+    `device`: "cpu", "cuda", "mps" or a certain GPU, as "cuda:1"; it decides for "auto". Raises UsageError for a name
+    that none has, MissingDependency, with what to install, for a GPU that cannot be used and an extension not built.
     """
     check.instance("backend", name, str)
     check.one_of("backend", name, BACKENDS)
     check.instance("threads", threads, int)
     check.at_least("threads", threads, 0, "0 takes one thread per core.")
     check.within("threads", threads, 0, check.MAX_THREADS, "0 takes one thread per core.")
-    device_type = check.device(device)
-    if name == "cuda" or (name == "auto" and (device_type == "cuda" or (not device_type and _sees_gpu()))):
-        return _gpu_backend(device)
+    if gpu := _gpu_of(name, check.device(device)):
+        from gsopt.raster.device.gpus import open_gpu
+
+        return open_gpu(gpu, device)
     if name == "reference":
         from gsopt.raster.reference import ReferenceBackend
 
@@ -121,17 +123,17 @@ def make_backend(name: str = "auto", threads: int = 0, device: str = "") -> Back
     return backend
 
 
-def _sees_gpu() -> bool:
-    from gsopt.raster.device.gpu import available
+def _gpu_of(backend: str, device: str) -> str:
+    """The kind of GPU that a backend and a kind of device ask for, or nothing."""
+    if backend in GPUS:
+        if device not in ("", backend):
+            raise UsageError(f"`device` is {device}, but `backend` is {backend}. Leave one of them out.")
+        return backend
+    if backend != "auto" or device == "cpu":
+        return ""
+    from gsopt.raster.device.gpus import seen
 
-    return available()
-
-
-def _gpu_backend(device: str) -> Backend:
-    from gsopt.raster.device.backend import DeviceBackend
-    from gsopt.raster.device.gpu import gpu_runtime
-
-    return DeviceBackend(gpu_runtime(device))
+    return device or seen()
 
 
 def _validate_types(gaussians: object, cameras: object, settings: object, background: object) -> None:

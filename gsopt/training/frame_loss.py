@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsopt.geometry.precision import widest
 from gsopt.raster.backend import Backend, RenderedFrame
 from gsopt.training.exposure import Exposure
 from gsopt.training.plan import LossWeights
@@ -72,7 +73,7 @@ def depth_gradients(
     if target.alphas is not None:
         known &= target.alphas > SOLID
     v_depths, v_alphas = torch.zeros_like(depths), torch.zeros_like(alphas)
-    D, A, y = depths[known].double(), alphas[known].double(), target.inverse_depths[known].double()
+    D, A, y = (values[known].to(widest(depths.device)) for values in (depths, alphas, target.inverse_depths))
     if len(D) < LEAST_DEPTH_PIXELS:
         return v_depths, v_alphas
     w = A / D

@@ -27,7 +27,7 @@ from gsopt.init.guessed_views import with_guessed_views
 from gsopt.init.mask_repair import RepairedMask, load_with_agreeing_masks
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
-from gsopt.raster.device.memory import PRIOR_BYTES, Memory
+from gsopt.raster.device.memory import PRIOR_BYTES, Memory, free_bytes, is_out_of_memory
 from gsopt.raster.threads import one_torch_thread
 from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
 from gsopt.training.estimate import estimate, memory_limit
@@ -178,16 +178,15 @@ def require_memory(
             expected.require(limit)
         found: dict[str, float] = {"memory_mb": round(expected.memory / 1e6)}
         return found if guidance is not None else {**found, "cpu_seconds": round(expected.seconds)}
-    if backend.device.type != "cuda":
+    if backend.device.type == "cpu":
         return None
     views = scene.drawn
     pixels = max(view.camera.width * view.camera.height for view in views)
     every = sum(16 * view.camera.width * view.camera.height for view in views)
     targets = min(int(plan.target_cache_mb * 1e6), every)
-    free, _ = torch.cuda.mem_get_info(backend.device)
     prior = PRIOR_BYTES if guidance is not None else 0
     memory = Memory.of(plan.density.max_gaussians, plan.schedule.max_sh_degree, pixels, targets, prior)
-    memory.require(backend.device, free)
+    memory.require(backend.device, free_bytes(backend.device))
     return {"memory_mb": round(memory.total / 1e6)}
 
 
@@ -196,8 +195,8 @@ def gpu_memory(step: int, last_good: Path | None) -> Iterator[None]:
     """NumericalError, with the way on, where a GPU's memory ends in the middle of a run."""
     try:
         yield
-    except (torch.OutOfMemoryError, NumericalError) as error:
-        if isinstance(error, NumericalError) and not isinstance(error.__cause__, torch.OutOfMemoryError):
+    except (RuntimeError, NumericalError) as error:
+        if not is_out_of_memory(error) and not is_out_of_memory(error.__cause__):
             raise
         state = f"The last good state is {last_good}." if last_good else "No checkpoint was written yet."
         raise NumericalError(

@@ -23,6 +23,7 @@ from gsopt.data.scene import Scene
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import quats, sh
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.precision import widest
 from gsopt.raster.backend import Gradients
 
 TENSORS = ("viewmats", "whitening", "exp_avg", "exp_avg_sq", "steps")
@@ -111,16 +112,16 @@ def pose_gradient(
 ) -> Float[Tensor, "6"]:
     """dL/d(omega, tau) at 0 of the picture that exp(xi) · viewmat sees (docs/math.md, eq. 23); float64."""
     rows = seen_rows(gradients)
-    device = gaussians.means.device
-    means, rotations = gaussians.means[rows].double(), gaussians.quats[rows].double()
-    v_means, v_quats = gradients.means[rows].double(), gradients.quats[rows].double()
-    R, t = viewmat[:3, :3].to(device), viewmat[:3, 3].to(device)
+    device, wide = gaussians.means.device, widest(gaussians.means.device)
+    means, rotations = gaussians.means[rows].to(wide), gaussians.quats[rows].to(wide)
+    v_means, v_quats = gradients.means[rows].to(wide), gradients.quats[rows].to(wide)
+    R, t = viewmat[:3, :3].to(means), viewmat[:3, 3].to(means)
     v_tau = R @ v_means.sum(0)
     v_geometry = v_means - _through_color(gaussians, gradients, rows, -R.T @ t, sh_degree)
     arms = torch.linalg.cross(means @ R.T + t, v_geometry @ R.T).sum(0)
-    axes = torch.eye(3, 4, dtype=torch.float64, device=device).roll(1, 1)[:, None]  # the quaternions i, j, k
+    axes = torch.eye(3, 4, dtype=wide, device=device).roll(1, 1)[:, None]  # the quaternions i, j, k
     turned = (quats.multiply(axes, rotations[None]) / 2 * v_quats).sum((1, 2))  # omega in the world's axes
-    return torch.cat([arms + R @ turned, v_tau]).cpu()
+    return torch.cat([arms + R @ turned, v_tau]).cpu().double()
 
 
 def seen_rows(gradients: Gradients) -> Bool[Tensor, "N"]:
@@ -131,13 +132,14 @@ def seen_rows(gradients: Gradients) -> Bool[Tensor, "N"]:
 def _through_color(
     gaussians: Gaussians, gradients: Gradients, rows: Tensor, center: Float[Tensor, "3"], sh_degree: int
 ) -> Float[Tensor, "M 3"]:
-    """The part of dL/dmeans that comes from the direction colors are looked up in; float64."""
-    means = gaussians.means[rows].double()
+    """The part of dL/dmeans that comes from the direction colors are looked up in, in the widest numbers."""
+    wide = widest(gaussians.means.device)
+    means = gaussians.means[rows].to(wide)
     count = (sh_degree + 1) ** 2 - 1
     if count == 0 or gaussians.shN.shape[1] == 0:
         return torch.zeros_like(means)
-    v_colors = gradients.sh0[rows, 0].double() / sh.C0
-    weights = torch.einsum("nkc,nc->nk", gaussians.shN[rows, :count].double(), v_colors)
+    v_colors = gradients.sh0[rows, 0].to(wide) / sh.C0
+    weights = torch.einsum("nkc,nc->nk", gaussians.shN[rows, :count].to(wide), v_colors)
     with torch.enable_grad():
         free = means.detach().requires_grad_()
         directions = torch.nn.functional.normalize(free - center, dim=1)

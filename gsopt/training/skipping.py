@@ -11,6 +11,7 @@ from torch import Tensor
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import sh
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.precision import widest
 from gsopt.raster.backend import Gradients
 
 
@@ -95,9 +96,9 @@ class Bands:
         variance = (s["gg"] - s["g"] ** 2 / n) / (n - 1).clamp_min(1)
         spread = (s["YY"] - s["Y"] ** 2 / n).clamp_min(0)
         correlation = s["Yg"] - s["Y"][..., None] * s["g"][:, None] / n[..., None]
-        enough = (s["n"] >= 2)[:, None].float()
-        expected = float((enough * spread.sum(dim=1, keepdim=True) * variance).sum(dtype=torch.float64))
-        found = float((enough[..., None] * correlation**2).sum(dtype=torch.float64))
+        enough, wide = (s["n"] >= 2)[:, None].float(), widest(s["n"].device)
+        expected = float((enough * spread.sum(dim=1, keepdim=True) * variance).sum(dtype=wide))
+        found = float((enough[..., None] * correlation**2).sum(dtype=wide))
         return found / expected if expected > 0 else 0.0
 
     def tensors(self) -> dict[str, Tensor]:

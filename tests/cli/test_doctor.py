@@ -6,6 +6,7 @@ import json
 from importlib import metadata
 
 import pytest
+from fake_mps import fake_mps
 from simt_runtime import SimtRuntime
 
 from gsopt import cli
@@ -98,7 +99,7 @@ def test_a_gpu_that_cannot_be_used_is_a_finding_with_its_pip_line(
 def test_a_gpu_is_named_and_timed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     runtime = SimtRuntime()
     runtime.about = {"device": "Pretended", "arch": "sm_90", "library": "libnvrtc 13.0", "compile_seconds": "2.50"}
-    monkeypatch.setattr("gsopt.raster.device.gpu.gpu_runtime", lambda: runtime)
+    monkeypatch.setattr("gsopt.raster.device.gpu.gpu_runtime", lambda device: runtime)
     monkeypatch.setattr(doctor, "GAUSSIANS", 200)
     found = findings(capsys)["gpu"]
     assert (found["device"], found["arch"], found["library"]) == ("Pretended", "sm_90", "libnvrtc 13.0")
@@ -106,3 +107,13 @@ def test_a_gpu_is_named_and_timed(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert found["ms_per_step"] > 0
     assert cli.main(["doctor"]) == 0
     assert "Pretended, sm_90" in capsys.readouterr().out
+
+
+def test_apples_gpu_is_named_and_timed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(doctor, "GAUSSIANS", 20)
+    with fake_mps():
+        found = findings(capsys)["gpu"]
+    assert (found["arch"], found["problem"]) == ("Metal", None)
+    assert found["device"].endswith("(mps:0)")
+    assert "compile_shader" in found["library"]
+    assert found["ms_per_step"] > 0

@@ -214,7 +214,7 @@ def test_parameters_that_changed_since_they_were_drawn_have_no_gradient(name: st
 
 def test_a_backend_is_chosen_by_name_only() -> None:
     assert make_backend("reference").name == "reference"
-    with pytest.raises(UsageError, match="`backend` must be one of auto, cpu, cuda, reference; got 'gpu'"):
+    with pytest.raises(UsageError, match="`backend` must be one of auto, cpu, cuda, mps, reference; got 'gpu'"):
         make_backend("gpu")
     with pytest.raises(UsageError, match="`threads` must be at least 0"):
         make_backend("auto", threads=-1)

@@ -7,9 +7,9 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from fake_mps import KERNEL_TEXTS
 from hypothesis import HealthCheck, assume, given, settings
 from raster_scenes import Case, cases, make_case, undecided_gaussians, undecided_pixels, weights_like, with_parameter
-from simt_runtime import simt_backend
 from tolerances import (
     ADAM,
     DECISION,
@@ -40,11 +40,11 @@ drawn = settings(
 
 def built(name: str, threads: int = 2) -> Backend:
     # Not skipped where the extension is missing: a build that fails must not pass for a kernel that is right.
-    return simt_backend() if name == "simt" else make_backend(name, threads)
+    return KERNEL_TEXTS[name]() if name in KERNEL_TEXTS else make_backend(name, threads)
 
 
 # The reference in float32 is held to the same tolerances: they ask of no kernel what plain float32 code cannot do.
-@pytest.fixture(params=["reference", "cpu", "simt"])
+@pytest.fixture(params=["reference", "cpu", "simt", "metal"])
 def backend(request: pytest.FixtureRequest) -> Backend:
     return built(request.param)
 
@@ -107,7 +107,7 @@ def test_many_layers_over_several_tiles(backend: Backend, setting: RasterSetting
 
 
 # Not for the float32 reference: its determinant is a difference of large products, good enough in float64 only.
-@pytest.mark.parametrize("name", ["cpu", "simt"])
+@pytest.mark.parametrize("name", ["cpu", "simt", "metal"])
 def test_needles(name: str) -> None:
     backend = built(name)
     case = make_case(6, count=24, width=48, height=32)

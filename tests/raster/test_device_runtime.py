@@ -59,7 +59,7 @@ class FakeLibrary:
         assert threads == 256
         self.launched.append(name)
         record = kernels(program())[name].from_address(values[0])
-        SimtRuntime().launch(name, blocks, record)
+        SimtRuntime().run(name, blocks, record)
         return self.launch_status
 
 
@@ -138,6 +138,39 @@ def test_kernels_are_compiled_once(machine: FakeLibrary, tmp_path: Path) -> None
     assert compiler.compiled == ["sm_90", "sm_90"]
 
 
+@pytest.mark.parametrize(
+    ("where", "other"),
+    [
+        ("gsopt.raster.device.gpu.program", lambda: program() + "// another"),
+        ("torch.cuda.get_device_capability", lambda device: (8, 0)),
+        ("test_device_runtime.FakeCompiler.version", "13.1"),
+        ("test_device_runtime.FakeCompiler.path", "/elsewhere/libnvrtc.so.13"),
+    ],
+)
+def test_another_text_gpu_or_compiler_compiles_anew(
+    where: str, other: Any, machine: FakeLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler = FakeCompiler()
+    with pretend_gpu():
+        GpuRuntime(GPU, tools(machine, compiler))
+        monkeypatch.setattr(where, other)
+        for _ in range(2):
+            GpuRuntime(GPU, tools(machine, compiler))
+    assert len(compiler.compiled) == 2
+
+
+def test_a_torch_without_nvrtc_is_told(machine: FakeLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*args: Any) -> None:
+        raise ImportError("nothing of that name")
+
+    monkeypatch.setattr("gsopt.raster.device.compiler.installed", lambda dialect: [])
+    monkeypatch.setattr("gsopt.raster.device.compiler.CudaCore", missing)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    for backend in ("cuda", "auto"):
+        with pytest.raises(MissingDependency, match=r"needs the library nvrtc 13.*pip install nvidia-cuda-nvrtc"):
+            make_backend(backend)
+
+
 def test_a_cache_that_refuses_costs_only_time(machine: FakeLibrary, tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file where the folder would be")
     assert cache.cached("key", lambda: b"made") == b"made"
@@ -198,7 +231,7 @@ def test_a_gpu_that_is_not_there(machine: FakeLibrary) -> None:
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:", "cuda:-1", "cuda:1234", "cuda:0; rm", "\N{DIGIT ONE}" * 5000, 1])
 def test_a_device_that_is_none(device: Any) -> None:
-    with pytest.raises(SettingError, match="`device` must be cpu, cuda or a GPU as cuda:1, got"):
+    with pytest.raises(SettingError, match="`device` must be cpu, cuda, mps or a GPU as cuda:1, got"):
         make_backend("auto", 0, device)
 
 

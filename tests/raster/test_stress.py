@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from fake_mps import KERNEL_TEXTS
 from raster_scenes import Case
-from simt_runtime import simt_backend
 from stress_cases import STRESSES, Stress
 from stress_measure import Truth, deviation
 from stress_scenes import ahead, crowd, layers, scales, scene
@@ -33,14 +33,15 @@ from gsopt.training.optimizer import OptimizedGaussians
 FULL = os.environ.get("GSOPT_STRESS") == "full"
 MANY = 5_000_000 if FULL else 100_000
 STEPS = 100_000 if FULL else 300
+KERNELS = [*_cpu.instruction_sets(), "simt"]
 PERFORMANCE = Path(__file__).resolve().parents[2] / "docs" / "performance.md"
 
 
-@pytest.fixture(params=[*_cpu.instruction_sets(), "simt"])
+@pytest.fixture(params=KERNELS)
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Backend:
-    """The compiled backend on every instruction set of this processor, and a GPU's kernels on it."""
-    if request.param == "simt":
-        return simt_backend()
+    """The compiled backend on every instruction set of this processor, and the kernels of GPUs on it."""
+    if request.param in KERNEL_TEXTS:
+        return KERNEL_TEXTS[request.param]()
     monkeypatch.setenv("GSOPT_ISA", request.param)
     return make_backend("cpu", 2)
 
@@ -50,6 +51,7 @@ def truth(stress: Stress) -> Truth:
     return Truth.of(stress.make())
 
 
+@pytest.mark.parametrize("backend", [*KERNELS, "metal"], indirect=True)
 @pytest.mark.parametrize("stress", STRESSES, ids=lambda stress: stress.name)
 def test_it_is_drawn_and_differentiated_as_by_the_reference(backend: Backend, stress: Stress) -> None:
     found = deviation(backend, truth(stress))

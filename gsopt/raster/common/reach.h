@@ -8,12 +8,12 @@
 
 namespace gsopt::GSOPT_ISA {
 
-constexpr float kRounding = 0x1p-24f;  // relative error of one operation on floats
+constexpr float kRounding = 1.f / (1 << 24);  // relative error of one operation on floats
 
 // Added to the level. A drawn splat has u² + v² <= level <= 8. Summing the exponent errs by 4 roundings of 8. v errs by
 // 4 roundings of C (|y| + 8) in `exponent`, here by 4 of C |y| and 1 of 128 C, a box of tiles; C |y| <= sqrt(8) + 8 C
 // where the ellipse meets the tile. An error of v counts 2 sqrt(8) times in v²: 1e-5 + 9e-5 C in all.
-constexpr float kLevelMargin = 0x1p-15f, kLevelMarginOfC = 0x1p-13f;
+constexpr float kLevelMargin = 1.f / (1 << 15), kLevelMarginOfC = 1.f / (1 << 13);
 
 // The end of a row is a sum of lengths. It errs by 10 roundings of the sum of their sizes, u in `exponent` by 5: twice
 // that.
@@ -59,13 +59,13 @@ template <class F> struct StripEnds {
 struct Span {
   int x0, x1;
 };
+inline float in_tiles(float x) { return clamp(x * (1.f / kTile), -1.f, 65536.f); }
 inline Span span_of(float mx, float top, float A, float B, float C, float log2_opacity, float extent) {
   const Reach<float> reach(A, B, C, log2_opacity);
   const StripEnds<float> ends(reach, reach.rightmost(), top, mx, mx, extent);
   if (!(ends.square >= 0.f)) return {0, 0};
-  const auto tile = [](float x) { return clamp(x * (1.f / kTile), -1.f, 65536.f); };
-  return {
-      static_cast<int>(ceil(tile(ends.left - (kTile - 0.5f)))), static_cast<int>(floor(tile(ends.right - 0.5f))) + 1};
+  return {static_cast<int>(ceil(in_tiles(ends.left - (kTile - 0.5f)))),
+      static_cast<int>(floor(in_tiles(ends.right - 0.5f))) + 1};
 }
 
 }  // namespace gsopt::GSOPT_ISA

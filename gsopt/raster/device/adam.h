@@ -9,8 +9,8 @@ struct AdamTensor {
   Index count;
   int first_block;
   float step_size, inverse_root;
-  const float* gradient;
-  float *param, *exp_avg, *exp_avg_sq;
+  GLOBAL const float* gradient;
+  GLOBAL float *param, *exp_avg, *exp_avg_sq;
 };
 
 struct AdamArguments {
@@ -19,14 +19,22 @@ struct AdamArguments {
   AdamTensor of[6];
 };
 
+// Steps number i of a tensor, or of one band.
+template <class Tensor> inline void step_number(const AdamRates& rates, const Tensor& of, float gradient, Index i) {
+  float param = of.param[i], mean = of.exp_avg[i], square = of.exp_avg_sq[i];
+  adam_number(rates, of.step_size, of.inverse_root, gradient, param, mean, square);
+  of.param[i] = param;
+  of.exp_avg[i] = mean;
+  of.exp_avg_sq[i] = square;
+}
+
 KERNEL(adam, AdamArguments) {
   int k = 0;
   while (k + 1 < a.tensors && a.of[k + 1].first_block <= block()) ++k;
   PHASE(t) {
     const AdamTensor& of = a.of[k];
     const Index i = static_cast<Index>(block() - of.first_block) * kThreads + t;
-    if (i < of.count)
-      adam_number(a.rates, of.step_size, of.inverse_root, of.gradient[i], of.param[i], of.exp_avg[i], of.exp_avg_sq[i]);
+    if (i < of.count) step_number(a.rates, of, of.gradient[i], i);
   }
 }
 
@@ -36,8 +44,8 @@ struct AdamBandsArguments {
   int count, sh_degree, sh_rest;  // of Gaussians
   AdamRates rates;
   float step_size, inverse_root;
-  const float *means, *v_sh0;
-  float *param, *exp_avg, *exp_avg_sq;
+  GLOBAL const float *means, *v_sh0;
+  GLOBAL float *param, *exp_avg, *exp_avg_sq;
 };
 
 constexpr int kBandGroup = 64;  // Gaussians
@@ -51,12 +59,10 @@ KERNEL(adam_bands, AdamBandsArguments) {
   }
   PHASE(t) {
     for (int i = t; i < n * stride; i += kThreads) {
-      const BandPull& of = pull[i / stride];
+      IN_BLOCK const BandPull& of = pull[i / stride];
       const int channel = i % 3;
       const float v = channel == 0 ? of.v_color.x : (channel == 1 ? of.v_color.y : of.v_color.z);
-      const Index at = first * stride + i;
-      adam_number(
-          a.rates, a.step_size, a.inverse_root, v * of.Y[i % stride / 3], a.param[at], a.exp_avg[at], a.exp_avg_sq[at]);
+      step_number(a.rates, a, v * of.Y[i % stride / 3], first * stride + i);
     }
   }
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -12,16 +13,21 @@ from torch import Tensor
 from gsopt.errors import UsageError
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.precision import widest
 from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame, enough_memory
 from gsopt.raster.device.camera import Views
 from gsopt.raster.device.frame import SUM_FIELDS, TILE, Context, Entries, Splats
-from gsopt.raster.device.layout import filled, kernels, members
+from gsopt.raster.device.layout import kernels, members
 from gsopt.raster.device.runtime import THREADS, Runtime
 from gsopt.raster.device.source import program
 from gsopt.raster.tensors import as_float32, contiguous, overwritable
 
 MOST_TENSORS = 6
 """Parameters of a Gaussian, which one launch of `adam` steps."""
+NO_TENSOR = dict.fromkeys(("count", "first_block", "step_size", "inverse_root"), 0) | dict.fromkeys(
+    ("gradient", "param", "exp_avg", "exp_avg_sq")
+)
+"""Fills the places that `adam` does not read."""
 BAND_GROUP = 64
 """Gaussians of a block of `adam_bands`: `kBandGroup` in adam.h."""
 
@@ -33,12 +39,7 @@ class DeviceBackend:
         self.runtime = runtime
         self.name = runtime.name
         self.device = runtime.device
-        self._records = kernels(program())
-        parts = members(self._records["project_gaussians"])
-        self._parameters = parts["P"]
-        self._views = Views(parts["camera"])
-        stepped = members(self._records["adam"])
-        self._adam_rates, self._adam_tensor = stepped["rates"], stepped["of"]._type_
+        self._views = Views(members(kernels(program())["project_gaussians"])["camera"])
 
     def forward(
         self,
@@ -56,7 +57,7 @@ class DeviceBackend:
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         behind = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
         with enough_memory(len(gaussians), width, height):
-            view, P = self._views.of(camera, settings), self._parameters_of(gaussians, settings)
+            view, P = self._views.of(camera, settings), _parameters(gaussians, settings)
             splats = Splats.of(len(gaussians), self.device)
             grid = {"tiles_x": tiles_x, "tiles_y": tiles_y}
             self._launch("project_gaussians", len(gaussians), camera=view, P=P, **grid, **vars(splats))
@@ -130,7 +131,7 @@ class DeviceBackend:
         }
         for kernel in ("ssim_of_tiles", "ssim_gradient"):
             self._launch(kernel, 3 * tiles * THREADS, **arguments)
-        l1, ssim = (sums.sum(0, dtype=torch.float64) / rendered.numel()).tolist()
+        l1, ssim = (sums.sum(0, dtype=widest(self.device)) / rendered.numel()).tolist()
         return Photometric(l1, ssim, (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim), v_rendered)
 
     def adam(
@@ -144,7 +145,7 @@ class DeviceBackend:
         settings: RasterSettings,
     ) -> None:
         """See `Backend.adam`. All tensors must be float32, contiguous and on the device."""
-        rates = filled(self._adam_rates, vars(step))
+        rates = {"beta1": step.beta1, "beta2": step.beta2, "eps": step.eps}
         tensors, blocks = [], 0
         for name in sorted(step.lr, key=lambda name: name != "shN"):
             record = _stepped(name, gaussians, exp_avg, exp_avg_sq, step)
@@ -154,9 +155,8 @@ class DeviceBackend:
                 continue
             tensors.append({**record, "gradient": gradient, "count": gradient.numel(), "first_block": blocks})
             blocks += -(-gradient.numel() // THREADS)
-        unused = [self._adam_tensor()] * (MOST_TENSORS - len(tensors))
-        filled_in = [filled(self._adam_tensor, _addresses(tensor)) for tensor in tensors]
-        self._launch("adam", blocks * THREADS, rates=rates, tensors=len(tensors), of=filled_in + unused)
+        of = tensors + [NO_TENSOR] * (MOST_TENSORS - len(tensors))
+        self._launch("adam", blocks * THREADS, rates=rates, tensors=len(tensors), of=of)
 
     def _adam_bands(
         self,
@@ -178,12 +178,6 @@ class DeviceBackend:
             v_sh0=gradients.sh0,
             **record,
         )
-
-    def _parameters_of(self, gaussians: Gaussians, settings: RasterSettings) -> Any:
-        tensors = {name: tensor.data_ptr() for name, tensor in gaussians.items()}
-        degree = min(settings.sh_degree, gaussians.sh_degree)
-        sizes = {"count": len(gaussians), "sh_degree": degree, "sh_rest": gaussians.shN.shape[1]}
-        return filled(self._parameters, {**sizes, **tensors})
 
     def _blend(
         self, splats: Splats, entries: Entries, size: tuple[int, int], behind: tuple[float, ...], depth: bool
@@ -218,11 +212,9 @@ class DeviceBackend:
         return sums
 
     def _launch(self, kernel: str, threads: int, **arguments: Any) -> None:
-        """Start a kernel of so many threads; tensors are handed on as pointers, which must live until then."""
-        if threads == 0:
-            return
-        record = filled(self._records[kernel], _addresses(arguments))
-        self.runtime.launch(kernel, -(-threads // THREADS), record)
+        """Start a kernel of so many threads."""
+        if threads:
+            self.runtime.launch(kernel, -(-threads // THREADS), arguments)
 
     def _require_here(self, gaussians: Gaussians) -> None:
         if gaussians.means.device != self.device:
@@ -230,6 +222,12 @@ class DeviceBackend:
                 f"The backend {self.name} draws Gaussians on {self.device}, got them on {gaussians.means.device}. "
                 "Move them with Gaussians.to()."
             )
+
+
+def _parameters(gaussians: Gaussians, settings: RasterSettings) -> Mapping[str, Any]:
+    degree = min(settings.sh_degree, gaussians.sh_degree)
+    sizes = {"count": len(gaussians), "sh_degree": degree, "sh_rest": gaussians.shN.shape[1]}
+    return {**sizes, **dict(gaussians.items())}
 
 
 def _pixels(size: tuple[int, int]) -> int:
@@ -248,11 +246,6 @@ def _lists(splats: Splats, entries: Entries, size: tuple[int, int], behind: tupl
         "tile_begin": entries.tile_begin,
         "ids": entries.ids,
     }
-
-
-def _addresses(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The same with the addresses of tensors."""
-    return {name: value.data_ptr() if isinstance(value, Tensor) else value for name, value in arguments.items()}
 
 
 def _stepped(

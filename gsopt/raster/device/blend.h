@@ -7,10 +7,10 @@ namespace gsopt::GSOPT_ISA {
 struct BlendArguments {
   int width, height, tiles_x;
   float background[3];
-  const Record* records;
-  const int *tile_begin, *ids;  // [tiles + 1] first entry of a tile; [entries] the splat of an entry
-  float *colors, *alphas, *depths, *transmittance;  // depths may be null
-  int* last;  // [pixels] number in its tile, from 1, of the last splat that a pixel took
+  GLOBAL const Record* records;
+  GLOBAL const int *tile_begin, *ids;  // [tiles + 1] first entry of a tile; [entries] the splat of an entry
+  GLOBAL float *colors, *alphas, *depths, *transmittance;  // depths may be null
+  GLOBAL int* last;  // [pixels] number in its tile, from 1, of the last splat that a pixel took
 };
 
 struct Pixel {
@@ -19,11 +19,12 @@ struct Pixel {
 };
 
 // The splats of a chunk, `first` being how many of the tile came before.
-inline void blend_pixel(const Row* rows, int n, int first, int t, Pixel& p) {
+inline void blend_pixel(IN_BLOCK const Row* rows, int n, int first, int t, Pixel& p) {
   const float X = pixel_x(t), Y = pixel_y(t);
   for (int i = 0; i < n && p.T > kTransmittanceMin; ++i) {
     Whitened<float> at;
-    const float alpha = alpha_of(exponent(spread(rows[i]), X, Y, at)), weight = alpha * p.T;
+    const Spread<float> splat = spread(rows[i]);
+    const float alpha = alpha_of(exponent(splat, X, Y, at)), weight = alpha * p.T;
     if (!(alpha > 0.f)) continue;
     p.r += rows[i].r * weight;
     p.g += rows[i].g * weight;
@@ -44,15 +45,16 @@ inline void write_pixel(const BlendArguments& a, Index at, const Pixel& p) {
 
 KERNEL(blend, BlendArguments) {
   SHARED Row rows[kThreads];
+  SHARED int scratch;
   Own<Pixel> pixel;
   Own<bool> done;
-  const Tile tile(a.tiles_x, a.width, a.height);
+  const Tile tile(block(), a.tiles_x, a.width, a.height);
   const int begin = a.tile_begin[block()], end = a.tile_begin[block() + 1];
   PHASE(t) {
     pixel[t] = {1.f, 0.f, 0.f, 0.f, 0.f, 0};
     done[t] = !tile.has(t);
   }
-  for (int first = begin; first < end && !all_threads(done); first += kThreads) {
+  for (int first = begin; first < end && !all_threads(done, &scratch); first += kThreads) {
     const int n = end - first < kThreads ? end - first : kThreads;
     PHASE(t) {
       if (t < n) rows[t] = row_of(a.records[a.ids[first + t]], tile);

@@ -11,18 +11,17 @@ namespace gsopt::GSOPT_ISA {
 struct BlendBackwardArguments {
   int width, height, tiles_x;
   float background[3];
-  const Record* records;
-  const int *tile_begin, *ids;  // as in BlendArguments
-  const Index* slots;           // [entries] where the row of an entry goes
-  const float* transmittance;
-  const int* last;
-  const float *v_colors, *v_alphas, *v_depths;  // the last two may be null
-  Sums* sums;                                   // [slots]
+  GLOBAL const Record* records;
+  GLOBAL const int *tile_begin, *ids;  // as in BlendArguments
+  GLOBAL const Index* slots;           // [entries] where the row of an entry goes
+  GLOBAL const float* transmittance;
+  GLOBAL const int* last;
+  GLOBAL const float *v_colors, *v_alphas, *v_depths;  // the last two may be null
+  GLOBAL Sums* sums;                                   // [slots]
 };
 
-constexpr int kBatch = 16;                            // splats at a time
-constexpr int kPitch = kThreads + kThreads / kBatch;  // so that two splats' pixels lie in different banks
-static_assert(kThreads / kBatch == kTile, "a thread for every splat and column");
+constexpr int kPitch = kThreads + kTile;  // so that two splats' pixels lie in different banks
+static_assert(kThreads >= kBatch * kTile, "a thread for every splat and column");
 
 // A pixel's way back.
 struct Pull {
@@ -42,15 +41,16 @@ union Scratch {
   struct {
     float weight[kBatch][kPitch], s[kBatch][kPitch];
   } at;
-  float sums[kThreads][kRowFields + 1];
+  float sums[kBatch * kTile][kRowFields + 1];
 };
 
-inline void pull_splats(const Row* rows, int n, int first, int t, Pull& p, Scratch& out) {
+inline void pull_splats(IN_BLOCK const Row* rows, int n, int first, int t, Pull& p, IN_BLOCK Scratch& out) {
   const float X = pixel_x(t), Y = pixel_y(t);
   for (int j = n - 1; j >= 0; --j) {
     Whitened<float> at;
-    const Row& row = rows[j];
-    const float alpha = first + j < p.last ? alpha_of(exponent(spread(row), X, Y, at)) : 0.f;
+    IN_BLOCK const Row& row = rows[j];
+    const Spread<float> splat = spread(row);
+    const float alpha = first + j < p.last ? alpha_of(exponent(splat, X, Y, at)) : 0.f;
     out.at.weight[j][t] = out.at.s[j][t] = 0.f;
     if (!(alpha > 0.f)) continue;
     const float q = row.r * p.r + row.g * p.g + row.b * p.b + row.depth * p.depth;
@@ -63,13 +63,15 @@ inline void pull_splats(const Row* rows, int n, int first, int t, Pull& p, Scrat
 }
 
 // The sums (10) and (11) of splat j over column x of the tile; `g` holds the pixels' gradients.
-inline Sums column_sums(const Row& row, const Scratch& in, const float (*g)[kThreads], int j, int x) {
+inline Sums column_sums(
+    IN_BLOCK const Row& row, IN_BLOCK const Scratch& in, IN_BLOCK const float (*g)[kThreads], int j, int x) {
+  const Spread<float> splat = spread(row);
   Sums out = {};
   for (int y = 0; y < kTile; ++y) {
     const int t = y * kTile + x;
     const float weight = in.at.weight[j][t], s = in.at.s[j][t];
     Whitened<float> at;
-    exponent(spread(row), pixel_x(t), pixel_y(t), at);
+    exponent(splat, pixel_x(t), pixel_y(t), at);
     const float su = s * at.u, sv = s * at.v;
     out.at[kS] += s;
     out.at[kSu] += su;
@@ -96,7 +98,7 @@ KERNEL(blend_backward, BlendBackwardArguments) {
   SHARED int deepest;
   Own<Pull> pull;
   Own<Sums> column;
-  const Tile tile(a.tiles_x, a.width, a.height);
+  const Tile tile(block(), a.tiles_x, a.width, a.height);
   const int begin = a.tile_begin[block()], end = a.tile_begin[block() + 1];
   PHASE(t) {
     if (t == 0) deepest = 0;

@@ -5,6 +5,7 @@ Builds of torch for a GPU bring the library along; `nvidia-cuda-nvrtc` of PyPI i
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import ctypes.util
 import re
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsopt.errors import MissingDependency
+from gsopt.raster.device.cuda_core import CudaCore
 
 OPTIONS = ("--std=c++17",)
 
@@ -32,6 +34,8 @@ class Dialect:
     """Patterns of the library's file name, on Linux and on Windows."""
     folders: tuple[str, ...]
     """Places under a folder of installed packages."""
+    system: tuple[str, ...]
+    """Names under which the system may have it."""
 
 
 CUDA = Dialect(
@@ -41,8 +45,17 @@ CUDA = Dialect(
     ("--device-as-default-execution-space",),
     ("libnvrtc.so.*", "nvrtc64_*.dll"),
     ("nvidia/cu13/lib", "nvidia/cuda_nvrtc/lib", "nvidia/cu13/bin/x86_64", "nvidia/cuda_nvrtc/bin", "torch/lib"),
+    ("nvrtc",),
 )
-HIP = Dialect("hiprtc", "Code", "--offload-arch=", (), ("libhiprtc.so*", "hiprtc*.dll"), ("torch/lib",))
+HIP = Dialect(
+    "hiprtc",
+    "Code",
+    "--offload-arch=",
+    (),
+    ("libhiprtc.so*", "hiprtc*.dll"),
+    ("torch/lib",),
+    ("hiprtc", "amdhip64"),  # older ones are a part of the driver
+)
 
 
 class Compiler:
@@ -107,17 +120,22 @@ class Compiler:
         return getattr(self._library, f"{self._dialect.prefix}{name}")
 
 
-def find_compiler(dialect: Dialect = CUDA, major: str | None = None) -> Compiler:
-    """The library of version `major` beside torch, else that of the system; any version if `major` is absent.
+def find_compiler(dialect: Dialect = CUDA, major: str | None = None) -> Compiler | CudaCore:
+    """The library of version `major` beside torch, else that of the system, else the one that cuda-core finds; any
+    version if `major` is absent.
 
     Raises MissingDependency, with the pip line, where there is none.
     """
     found = [path for path in installed(dialect) if major is None or _is_version(path.name, major)]
-    for path in [*map(str, found), *filter(None, [ctypes.util.find_library(dialect.prefix)])]:
+    for path in [*map(str, found), *filter(None, map(ctypes.util.find_library, dialect.system))]:
         try:
             return Compiler(path, dialect)
         except OSError:
             continue
+    with contextlib.suppress(ImportError, RuntimeError):
+        core = CudaCore()
+        if dialect is CUDA and (major is None or core.version.partition(".")[0] == major):
+            return core
     raise MissingDependency(
         f"The GPU backend needs the library {dialect.prefix}{' ' + major if major else ''}, which builds of torch for "
         f"GPUs bring along and which is not there. {remedy(dialect, major)}"

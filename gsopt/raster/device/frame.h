@@ -30,18 +30,18 @@ constexpr int kMaxBands = 15;  // rows of shN
 // N Gaussians as the optimizer stores them.
 struct Parameters {
   int count, sh_degree, sh_rest;  // highest band to evaluate; number of rows of shN
-  const float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN;
+  GLOBAL const float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN;
 };
 
-inline Vec3<float> load3(const float* rows, Index n) { return {rows[3 * n], rows[3 * n + 1], rows[3 * n + 2]}; }
-inline void store3(float* rows, Index n, const Vec3<float>& v) {
+inline Vec3<float> load3(GLOBAL const float* rows, Index n) { return {rows[3 * n], rows[3 * n + 1], rows[3 * n + 2]}; }
+inline void store3(GLOBAL float* rows, Index n, Vec3<float> v) {
   rows[3 * n] = v.x;
   rows[3 * n + 1] = v.y;
   rows[3 * n + 2] = v.z;
 }
 
 inline Splat3D<float> load_splat(const Parameters& P, Index n) {
-  const float* q = P.quats + 4 * n;
+  GLOBAL const float* q = P.quats + 4 * n;
   return {load3(P.means, n), q[0], q[1], q[2], q[3], load3(P.log_scales, n), P.logit_opacities[n]};
 }
 
@@ -61,11 +61,11 @@ struct alignas(16) Sums {
   float at[kRowFields];
 };
 
-// An image and the tile of this block.
+// An image and the tile of a block.
 struct Tile {
   int x, y, width, height;  // its first pixel; the image
-  Tile(int tiles_x, int width_, int height_)
-      : x(block() % tiles_x * kTile), y(block() / tiles_x * kTile), width(width_), height(height_) {}
+  Tile(int block, int tiles_x, int width_, int height_)
+      : x(block % tiles_x * kTile), y(block / tiles_x * kTile), width(width_), height(height_) {}
   bool has(int t) const { return x + t % kTile < width && y + t / kTile < height; }
   Index pixel(int t) const { return static_cast<Index>(y + t / kTile) * width + x + t % kTile; }
 };
@@ -73,11 +73,11 @@ struct Tile {
 inline float pixel_x(int t) { return static_cast<float>(t % kTile) - 7.5f; }
 inline float pixel_y(int t) { return static_cast<float>(t / kTile) - 7.5f; }
 
-inline Row row_of(const Record& r, const Tile& tile) {
+inline Row row_of(GLOBAL const Record& r, const Tile& tile) {
   const float x = r.mx - static_cast<float>(tile.x + kTile / 2), y = r.my - static_cast<float>(tile.y + kTile / 2);
   const Whitened<float> center = at_center(r.A, r.B, r.C, x, y);
   return {r.A, r.B, r.C, center.u, center.v, r.log2_opacity, r.r, r.g, r.b, r.depth};
 }
-inline Spread<float> spread(const Row& r) { return {r.A, r.B, r.C, r.u0, r.v0, r.log2_opacity}; }
+inline Spread<float> spread(IN_BLOCK const Row& r) { return {r.A, r.B, r.C, r.u0, r.v0, r.log2_opacity}; }
 
 }  // namespace gsopt::GSOPT_ISA

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -103,7 +103,7 @@ class Context:
 
     gaussians: Gaussians
     camera: Any
-    parameters: Any
+    parameters: Mapping[str, Any]
     background: tuple[float, ...]
     size: tuple[int, int]
     """Height and width, px."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import ctypes
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from gsopt.errors import MissingDependency, UsageError
 from gsopt.raster.device import cache
 from gsopt.raster.device.compiler import CUDA, HIP, Compiler, find_compiler
+from gsopt.raster.device.cuda_core import CudaCore
 from gsopt.raster.device.driver import CUDA_DRIVER, HIP_DRIVER, Driver, open_driver
-from gsopt.raster.device.layout import kernels
+from gsopt.raster.device.layout import filled, kernels
 from gsopt.raster.device.source import program
 
 INSTALL = "pip install torch, with the index that torch's start page names for your CUDA"
@@ -22,7 +24,7 @@ INSTALL = "pip install torch, with the index that torch's start page names for y
 class Tools:
     """A compiler and a driver that belong together."""
 
-    compiler: Compiler
+    compiler: Compiler | CudaCore
     driver: Driver
 
     @staticmethod
@@ -46,11 +48,12 @@ class GpuRuntime:
         arch = processor(device)
         target = tools.compiler.newest(arch)
         text = program()
+        self._records = kernels(text)
         key = f"{text} {target} {tools.compiler.version} {tools.compiler.path}"
         code = cache.cached(key, lambda: tools.compiler.compile(text, target))
         with torch.cuda.device(device):
             torch.empty(1, device=device)  # torch makes its context, and makes it current
-            self._functions = tools.driver.load(code, list(kernels(text)))
+            self._functions = tools.driver.load(code, list(self._records))
         self.about = {
             "device": f"{torch.cuda.get_device_name(device)} ({device})",
             "arch": arch,
@@ -58,11 +61,11 @@ class GpuRuntime:
             "compile_seconds": f"{time.perf_counter() - began:.2f}",
         }
 
-    def launch(self, kernel: str, blocks: int, arguments: ctypes.Structure) -> None:
+    def launch(self, kernel: str, blocks: int, arguments: Mapping[str, Any]) -> None:
         """See `Runtime.launch`."""
         with torch.cuda.device(self.device):
             stream = torch.cuda.current_stream(self.device).cuda_stream
-            self._driver.launch(self._functions[kernel], blocks, stream, arguments)
+            self._driver.launch(self._functions[kernel], blocks, stream, filled(self._records[kernel], arguments))
 
 
 def processor(device: torch.device) -> str:

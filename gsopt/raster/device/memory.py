@@ -1,4 +1,4 @@
-"""The memory that a run takes on its GPU, estimated before the first step."""
+"""The memory of a GPU: what a run takes, estimated before the first step, what is free, and its end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SPLAT_BYTES = 160
 PIXEL_BYTES = 120
 """A pixel: the image, its gradient, the loss's maps and a target."""
 CONTEXT_BYTES = 600_000_000
-"""CUDA's own, with the kernels' code."""
+"""The driver's own, with the kernels' code."""
 PRIOR_BYTES = 1_000_000_000
 """A step of Stable Diffusion at 512 px (docs/howto/guidance.md), beside weights that are loaded by then."""
 COPIES = 6
@@ -46,7 +46,7 @@ class Memory:
 
     @property
     def total(self) -> int:
-        """All parts, and what CUDA takes for itself."""
+        """All parts, and what the driver takes for itself."""
         return self.gaussians + self.pixels + self.targets + self.prior + CONTEXT_BYTES
 
     def require(self, device: torch.device, free: int) -> None:
@@ -60,3 +60,16 @@ class Memory:
             "Lower --max-gaussians, scale the images down (-r 2), take another GPU (--device cuda:1), or use "
             "--backend cpu."
         )
+
+
+def free_bytes(device: torch.device) -> int:
+    """Memory of a GPU that nobody holds."""
+    if device.type == "mps":
+        return torch.mps.recommended_max_memory() - torch.mps.driver_allocated_memory()
+    return torch.cuda.mem_get_info(device)[0]
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """True where a GPU's memory ended: torch has a class for it with CUDA, and words with Metal."""
+    words = type(error) is RuntimeError and "out of memory" in str(error)
+    return words or isinstance(error, torch.OutOfMemoryError)

@@ -7,26 +7,27 @@ namespace gsopt::GSOPT_ISA {
 struct PhotometricArguments {
   int width, height, tiles_x, tiles;
   float weight_l1, weight_ssim;  // of the sum over pixels and channels
-  const float *rendered, *target;
-  float *d_mean, *d_square, *d_product;  // [H,W,3], (20)
-  float* sums;                           // [3 tiles, 2]: of |x - y| and of SSIM, one block each
-  float* v_rendered;
+  GLOBAL const float *rendered, *target;
+  GLOBAL float *d_mean, *d_square, *d_product;  // [H,W,3], (20)
+  GLOBAL float* sums;                           // [3 tiles, 2]: of |x - y| and of SSIM, one block each
+  GLOBAL float* v_rendered;
 };
 
 constexpr int kHalo = kTile + 2 * kRadius;
+constexpr int kRows = kHalo * kTile;  // numbers of a map filtered along the rows: kHalo rows of kTile columns
 
-// The tile of this block and its channel: the blocks of one tile are neighbors.
+// The tile of a block and its channel: the blocks of one tile are neighbors.
 struct Channel {
   int x, y, width, height, channel;
-  explicit Channel(const PhotometricArguments& a)
-      : x(block() / 3 % a.tiles_x * kTile), y(block() / 3 / a.tiles_x * kTile), width(a.width), height(a.height),
-        channel(block() % 3) {}
+  Channel(int block, const PhotometricArguments& a)
+      : x(block / 3 % a.tiles_x * kTile), y(block / 3 / a.tiles_x * kTile), width(a.width), height(a.height),
+        channel(block % 3) {}
   bool has(int column, int row) const {
     return x + column >= 0 && x + column < width && y + row >= 0 && y + row < height;
   }
   Index at(int column, int row) const { return (static_cast<Index>(y + row) * width + x + column) * 3 + channel; }
   // Number i of the tile and what a window around its pixels needs; zero outside the image.
-  float near(const float* image, int i) const {
+  float near(GLOBAL const float* image, int i) const {
     const int column = i % kHalo - kRadius, row = i / kHalo - kRadius;
     return has(column, row) ? image[at(column, row)] : 0.f;
   }
@@ -34,23 +35,19 @@ struct Channel {
 
 inline float window_at(int k) { return kWindow[k < kRadius ? kRadius - k : k - kRadius]; }
 
-// Filtered along the rows: kHalo rows of kTile columns.
-template <int Maps> struct Rows {
-  float of[Maps][kHalo * kTile];
-  // Down the column of thread t.
-  float filtered(int map, int t) const {
-    float sum = 0.f;
-    for (int k = 0; k < kTaps; ++k) sum += of[map][(t / kTile + k) * kTile + t % kTile] * window_at(k);
-    return sum;
-  }
-};
+// Down the column of thread t.
+inline float filtered(IN_BLOCK const float* rows, int t) {
+  float sum = 0.f;
+  for (int k = 0; k < kTaps; ++k) sum += rows[(t / kTile + k) * kTile + t % kTile] * window_at(k);
+  return sum;
+}
 
 // The sums of two numbers of every thread, in one order; into to[0] and to[1].
 struct Totals {
   float l1[kThreads], ssim[kThreads];
 };
 
-inline void filter_images(const float* x, const float* y, int i, Rows<4>& out) {
+inline void filter_images(IN_BLOCK const float* x, IN_BLOCK const float* y, int i, IN_BLOCK float (*out)[kRows]) {
   const int from = i / kTile * kHalo + i % kTile;
   float mx = 0.f, my = 0.f, square = 0.f, product = 0.f;
   for (int k = 0; k < kTaps; ++k) {
@@ -60,17 +57,17 @@ inline void filter_images(const float* x, const float* y, int i, Rows<4>& out) {
     square += w * (a * a + b * b);
     product += w * (a * b);
   }
-  out.of[0][i] = mx;
-  out.of[1][i] = my;
-  out.of[2][i] = square;
-  out.of[3][i] = product;
+  out[0][i] = mx;
+  out[1][i] = my;
+  out[2][i] = square;
+  out[3][i] = product;
 }
 
 KERNEL(ssim_of_tiles, PhotometricArguments) {
   SHARED float x[kHalo * kHalo], y[kHalo * kHalo];
-  SHARED Rows<4> rows;
+  SHARED float rows[4][kRows];
   SHARED Totals totals;
-  const Channel tile(a);
+  const Channel tile(block(), a);
   PHASE(t) {
     for (int i = t; i < kHalo * kHalo; i += kThreads) {
       x[i] = tile.near(a.rendered, i);
@@ -78,7 +75,7 @@ KERNEL(ssim_of_tiles, PhotometricArguments) {
     }
   }
   PHASE(t) {
-    for (int i = t; i < kHalo * kTile; i += kThreads) filter_images(x, y, i, rows);
+    for (int i = t; i < kRows; i += kThreads) filter_images(x, y, i, rows);
   }
   PHASE(t) {
     totals.l1[t] = totals.ssim[t] = 0.f;
@@ -86,15 +83,19 @@ KERNEL(ssim_of_tiles, PhotometricArguments) {
       const Index at = tile.at(t % kTile, t / kTile);
       const int here = (t / kTile + kRadius) * kHalo + t % kTile + kRadius;
       totals.l1[t] = abs(x[here] - y[here]);
-      totals.ssim[t] = ssim_partials(rows.filtered(0, t), rows.filtered(1, t), rows.filtered(2, t), rows.filtered(3, t),
-          a.d_mean[at], a.d_square[at], a.d_product[at]);
+      float d_mean, d_square, d_product;
+      totals.ssim[t] = ssim_partials(filtered(rows[0], t), filtered(rows[1], t), filtered(rows[2], t),
+          filtered(rows[3], t), d_mean, d_square, d_product);
+      a.d_mean[at] = d_mean;
+      a.d_square[at] = d_square;
+      a.d_product[at] = d_product;
     }
   }
-  for (int half = kThreads / 2; half > 0; half /= 2) {
+  for (int rest = kThreads / 2; rest > 0; rest /= 2) {
     PHASE(t) {
-      if (t < half) {
-        totals.l1[t] += totals.l1[t + half];
-        totals.ssim[t] += totals.ssim[t + half];
+      if (t < rest) {
+        totals.l1[t] += totals.l1[t + rest];
+        totals.ssim[t] += totals.ssim[t + rest];
       }
     }
   }
@@ -109,8 +110,8 @@ KERNEL(ssim_of_tiles, PhotometricArguments) {
 // The window is symmetric, so its transpose is itself: (21).
 KERNEL(ssim_gradient, PhotometricArguments) {
   SHARED float maps[3][kHalo * kHalo];
-  SHARED Rows<3> rows;
-  const Channel tile(a);
+  SHARED float rows[3][kRows];
+  const Channel tile(block(), a);
   PHASE(t) {
     for (int i = t; i < kHalo * kHalo; i += kThreads) {
       maps[0][i] = tile.near(a.d_mean, i);
@@ -119,11 +120,11 @@ KERNEL(ssim_gradient, PhotometricArguments) {
     }
   }
   PHASE(t) {
-    for (int i = t; i < 3 * kHalo * kTile; i += kThreads) {
-      const int map = i / (kHalo * kTile), at = i % (kHalo * kTile), from = at / kTile * kHalo + at % kTile;
+    for (int i = t; i < 3 * kRows; i += kThreads) {
+      const int map = i / kRows, at = i % kRows, from = at / kTile * kHalo + at % kTile;
       float sum = 0.f;
       for (int k = 0; k < kTaps; ++k) sum += window_at(k) * maps[map][from + k];
-      rows.of[map][at] = sum;
+      rows[map][at] = sum;
     }
   }
   PHASE(t) {
@@ -131,7 +132,7 @@ KERNEL(ssim_gradient, PhotometricArguments) {
       const Index at = tile.at(t % kTile, t / kTile);
       const float x = a.rendered[at], y = a.target[at], difference = x - y;
       const float sign = difference > 0.f ? a.weight_l1 : (difference < 0.f ? -a.weight_l1 : 0.f);
-      const float pull = rows.filtered(0, t) + x * 2.f * rows.filtered(1, t) + y * rows.filtered(2, t);
+      const float pull = filtered(rows[0], t) + x * 2.f * filtered(rows[1], t) + y * filtered(rows[2], t);
       a.v_rendered[at] = sign - a.weight_ssim * pull;
     }
   }

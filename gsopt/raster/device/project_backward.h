@@ -8,17 +8,17 @@ namespace gsopt::GSOPT_ISA {
 struct ProjectBackwardArguments {
   Camera camera;
   Parameters P;
-  const Record* records;
-  const Index* first_slot;
-  const int* tiles;
-  const Sums* sums;
+  GLOBAL const Record* records;
+  GLOBAL const Index* first_slot;
+  GLOBAL const int* tiles;
+  GLOBAL const Sums* sums;
   // shN and the last may be null.
-  float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;
+  GLOBAL float *means, *quats, *log_scales, *logit_opacities, *sh0, *shN, *means2d, *means2d_abs;
 };
 
 // False when all are zero, or there are none: no pixel saw it.
 inline bool sum_tiles(const ProjectBackwardArguments& a, Index n, Sums& total) {
-  const Sums* rows = a.sums + a.first_slot[n];
+  GLOBAL const Sums* rows = a.sums + a.first_slot[n];
   bool any = false;
   total = {};
   for (int k = 0; k < a.tiles[n]; ++k) {
@@ -30,7 +30,7 @@ inline bool sum_tiles(const ProjectBackwardArguments& a, Index n, Sums& total) {
 }
 
 // v_c of (10), none where a color was clamped at black.
-inline Vec3<float> color_gradient(const Record& r, const Sums& v) {
+inline Vec3<float> color_gradient(GLOBAL const Record& r, const Sums& v) {
   return {keep(r.r > 0.f, v.at[kWr]), keep(r.g > 0.f, v.at[kWg]), keep(r.b > 0.f, v.at[kWb])};
 }
 
@@ -39,7 +39,7 @@ inline Vec3<float> direction_gradient(const Parameters& P, Index n, const Vec3<f
   Vec3<float> Y[kMaxBands], out = {0.f, 0.f, 0.f};
   sh_basis_gradient(P.sh_degree, d.x, d.y, d.z, Y);
   const int bands = (P.sh_degree + 1) * (P.sh_degree + 1) - 1;
-  const float* shN = P.shN + 3 * P.sh_rest * n;
+  GLOBAL const float* shN = P.shN + 3 * P.sh_rest * n;
   for (int k = 0; k < kMaxBands; ++k)
     if (k < bands) out = out + Y[k] * dot(v_color, load3(shN, k));
   return out;
@@ -51,7 +51,8 @@ struct BandPull {
   Vec3<float> v_color;
 };
 // From dLoss/d(sh0) as it is written: whoever makes the gradient of the bands makes the same bits.
-NOT_INLINED BandPull band_pull(const Camera* cam, int degree, const float* means, const float* v_sh0, Index n) {
+NOT_INLINED BandPull band_pull(
+    const Camera* cam, int degree, GLOBAL const float* means, GLOBAL const float* v_sh0, Index n) {
   BandPull out;
   float inverse_distance;
   const Vec3<float> offset = load3(means, n) - splat3<float>(cam->pivot),
@@ -64,7 +65,7 @@ NOT_INLINED BandPull band_pull(const Camera* cam, int degree, const float* means
 
 inline void write_bands(const ProjectBackwardArguments& a, Index n) {
   const BandPull pull = band_pull(&a.camera, a.P.sh_degree, a.P.means, a.sh0, n);
-  float* to = a.shN + 3 * a.P.sh_rest * n;
+  GLOBAL float* to = a.shN + 3 * a.P.sh_rest * n;
   for (int k = 0; k < kMaxBands; ++k)
     if (k < a.P.sh_rest) store3(to, k, pull.v_color * pull.Y[k]);
 }
@@ -82,7 +83,8 @@ inline void write_zeros(const ProjectBackwardArguments& a, Index n) {
 }
 
 inline void write_gradient(const ProjectBackwardArguments& a, Index n, const Sums& sums) {
-  const Projected<float> p = project(a.camera, load_splat(a.P, n));
+  const Splat3D<float> splat = load_splat(a.P, n);
+  const Projected<float> p = project(a.camera, splat);
   const Whitening<float> L = whitening(p);
   const SplatGradient<float> v = splat_gradient(L, sums.at);
   const Splat3D<float> out = project_backward(a.camera, p, L, v);

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import torch
 
@@ -20,6 +20,9 @@ class Runtime(Protocol):
     about: dict[str, str]
     """Facts for `gsopt doctor`: device, arch, library, compile time."""
 
-    def launch(self, kernel: str, blocks: int, arguments: ctypes.Structure) -> None:
-        """Start a kernel behind what torch's current stream holds. Nothing waits for it here."""
+    def launch(self, kernel: str, blocks: int, arguments: Mapping[str, Any]) -> None:
+        """Start a kernel of these arguments, tensors among them, behind what torch's current stream holds.
+
+        Nothing waits for it here.
+        """
         ...

@@ -11,6 +11,9 @@
 #define PHASE(t) if (const int t = begin_phase(); true)
 // Memory of a block.
 #define SHARED __shared__
+// Where that lies which a pointer or a reference leads to: in the GPU's memory, in a block's, else with the thread.
+#define GLOBAL
+#define IN_BLOCK
 #define NOT_INLINED __attribute__((noinline))
 
 #if defined(__HIP__)
@@ -21,6 +24,7 @@ namespace gsopt::GSOPT_ISA {
 
 using Index = long long;
 constexpr int kThreads = 256;  // of a block
+constexpr int kBatch = 16;     // splats that blend_backward takes at a time: what a block's memory holds
 
 inline int block() { return static_cast<int>(blockIdx.x); }
 inline int begin_phase() {
@@ -33,8 +37,9 @@ template <class T> struct Own {
   T value;
   T& operator[](int) { return value; }
 };
-inline bool all_threads(Own<bool>& own) { return __syncthreads_and(own.value); }
-inline void shared_max(int* to, int value) { atomicMax(to, value); }
+// `scratch`: a number of the block that nothing else uses.
+inline bool all_threads(Own<bool>& own, IN_BLOCK int*) { return __syncthreads_and(own.value); }
+inline void shared_max(IN_BLOCK int* to, int value) { atomicMax(to, value); }
 
 inline float sqrt(float x) { return sqrtf(x); }
 inline float log2(float x) { return log2f(x); }

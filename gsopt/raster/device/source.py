@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ FOLDER = Path(__file__).parent
 INCLUDE = re.compile(r'^#include "([^"]+)"$')
 
 
+@functools.cache
 def program(simt: Path = FOLDER / "simt.h") -> str:
     """All kernels. `simt` says what a thread, a phase and a barrier are; tests give one for a processor."""
     return _with_includes(FOLDER / "kernels.h", {FOLDER / "simt.h": simt}, set())

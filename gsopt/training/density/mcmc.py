@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gsopt.geometry.precision import in_float64
 from gsopt.raster.backend import Gradients
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
@@ -97,8 +98,8 @@ class Mcmc:
         rows = torch.nonzero(copies > 1)[:, 0]
         opacities, shrink = shared(model.gaussians.opacities[rows], copies[rows])
         opacities = opacities.clamp(self._plan.prune_opacity, OPAQUE)
-        model.gaussians.logit_opacities[rows] = torch.logit(opacities).float()
-        model.gaussians.log_scales[rows] += shrink.log().float()[:, None]
+        model.gaussians.logit_opacities[rows] = torch.logit(opacities).to(model.gaussians.logit_opacities)
+        model.gaussians.log_scales[rows] += shrink.log().to(model.gaussians.log_scales)[:, None]
         model.forget(rows)
 
 
@@ -108,8 +109,8 @@ def shared(opacities: Float[Tensor, "M"], copies: Int[Tensor, "M"]) -> tuple[Flo
     o' = 1 - (1 - o)^(1/n), and the factor is o / Σ_{j=1..n} C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum over
     i and k with Σ_i C(i-1, k) = C(n, k+1) carried out, j = k + 1.
     """
-    n = copies.clamp_max(MAX_COPIES).double()
-    o = opacities.double().clamp_max(OPAQUE)
+    n = in_float64(copies.clamp_max(MAX_COPIES))
+    o = in_float64(opacities).clamp_max(OPAQUE)
     new = 1 - (1 - o) ** (1 / n)
     total = torch.zeros_like(o)
     term = torch.full_like(o, -1.0)
