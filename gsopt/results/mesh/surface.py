@@ -69,15 +69,15 @@ def smoothed(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray
 def decimated(
     vertices: NDArray[np.float32], faces: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """At most `count` faces, fewer where the surface is flat; all of them where every decimation breaks the surface."""
-    if len(faces) <= count:
-        return vertices, faces
+    """At most `count` faces, fewer where the surface is flat; twice, four times ... as many where so few break it."""
     simplify = require("fast_simplification", "mesh", PURPOSE).simplify
-    for haste in HASTES:
-        found = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=count, agg=haste)
-        fewer, kept = unfolded(found[0], found[1].astype(np.int64))
-        if is_closed(kept):
-            return fewer, kept
+    while count < len(faces):
+        for haste in HASTES:
+            found = simplify(vertices.astype(np.float32), faces.astype(np.int32), target_count=count, agg=haste)
+            fewer, kept = unfolded(found[0], found[1].astype(np.int64))
+            if is_closed(kept):
+                return fewer, kept
+        count *= 2
     return vertices, faces
 
 

@@ -30,7 +30,7 @@ from gsopt.results.mesh.fusion import box_around, fused
 from gsopt.results.mesh.median_depth import SLABS, depth_view, slab_planes
 
 pytest.importorskip("skimage")
-pytest.importorskip("fast_simplification")
+fast_simplification = pytest.importorskip("fast_simplification")
 
 SIDE, FOV, RADIUS = 48, 0.8, 1.0
 FLAT = RasterSettings(sh_degree=0)
@@ -312,3 +312,20 @@ def test_a_run_that_has_not_finished_and_a_package_that_is_absent_are_named(
     (run / "splat.ply").unlink()
     assert main(["mesh", str(run), "-o", str(tmp_path / "m.ply")]) == 3
     assert "has not finished" in capsys.readouterr().err
+
+
+def test_a_surface_that_few_faces_break_keeps_twice_as_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    axis = torch.linspace(-1, 1, 12)
+    field = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0) - 0.8
+    vertices, faces = surface.triangulated(field, box_around(torch.full((3,), -1.0), torch.full((3,), 1.0), 12))
+    real = fast_simplification.simplify
+
+    def breaking(points: object, corners: object, target_count: int, agg: int) -> tuple[np.ndarray, np.ndarray]:
+        found = real(points, corners, target_count=target_count, agg=agg)
+        return (found[0], found[1][1:]) if target_count < 120 else found
+
+    monkeypatch.setattr(fast_simplification, "simplify", breaking)
+    _, kept = surface.decimated(vertices, faces, 50)
+    assert len(faces) > 400
+    assert surface.is_closed(kept)
+    assert 100 < len(kept) <= 200
