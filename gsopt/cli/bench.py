@@ -101,6 +101,8 @@ class Suite:
     """Language model of the arm ours-llm, as `gsopt prompts --llm`."""
     model: Annotated[str, arg(metavar="NAME")] = ""
     """Its name there."""
+    estimate: bool = False
+    """Only print what the runs without a record will take: a trial of 100 steps of each scene, guided and not."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -242,7 +244,7 @@ def suite(flags: Suite) -> int:
 
     from gsopt.benchmark.suite import result_file
     from gsopt.benchmark.suite.html_page import write_html
-    from gsopt.benchmark.suite.runner import run_suite, work_folder
+    from gsopt.benchmark.suite.runner import estimate_suite, run_suite, work_folder
     from gsopt.benchmark.suite.single_run import SuiteContext
 
     output = flags.output.absolute()
@@ -250,7 +252,13 @@ def suite(flags: Suite) -> int:
     prior = str(folder.absolute()) if flags.prior and folder.is_dir() else flags.prior
     options = SuiteContext(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
     command = suite_command(flags)
-    failed = run_suite(output, whole, command, cases, options, lambda text: print(text, flush=True), farm)
+
+    def report(text: str) -> None:
+        print(text, flush=True)
+
+    if flags.estimate:
+        return InputError.exit_code if estimate_suite(output, whole, command, cases, options, report) else 0
+    failed = run_suite(output, whole, command, cases, options, report, farm)
     drawn = output.with_suffix(".html")
     write_html(result_file.read(output), result_file.read_images(output), drawn)
     print(f"Written: {output}, {drawn}")

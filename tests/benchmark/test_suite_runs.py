@@ -19,7 +19,7 @@ from PIL import Image
 from suite_records import MACHINE, record
 
 from gsopt import cli
-from gsopt.benchmark.suite import definition, result_file, run_figures, run_key, runner, single_run
+from gsopt.benchmark.suite import definition, estimate, result_file, run_figures, run_key, runner, single_run
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.data.scene import load_scene
 from gsopt.farm.job import Job, Outcome
@@ -269,6 +269,23 @@ def test_smoke_trains_evaluates_and_draws(smoke: Path) -> None:
         assert 0.3 < run["mean"]["mask_iou"] < 1
     assert "data:image/webp" in smoke.with_suffix(".html").read_text()
     assert list(runner.work_folder(smoke).glob("run-*")) == []
+
+
+def test_an_estimate_tries_every_scene_and_makes_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "smoke.json"
+    assert (
+        cli.main(["bench", "--suite", "smoke", "--seeds", "2", "--arms", "ours-0", "-o", str(file), "--estimate"]) == 0
+    )
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert [line.split(", ")[2] for line in lines] == ["unguided: 2 runs"] * len(lines)
+    assert last.startswith(f"{2 * len(lines)} runs are due: at least 0:0")
+    assert not file.exists() or result_file.read(file)["runs"] == []
+    assert list(runner.work_folder(file).glob("run-*")) == []
+
+
+def test_a_trial_is_scaled_to_the_steps_of_a_run() -> None:
+    assert estimate.Trial(setup=2.0, step=0.01, memory_mb=0.0).seconds(7000) == 72.0
+    assert [estimate.hours(seconds) for seconds in (0, 89, 90, 90_061)] == ["0:00 h", "0:01 h", "0:02 h", "25:01 h"]
 
 
 def test_the_same_run_gives_the_same_figures(smoke: Path, tmp_path: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from gsopt.benchmark.suite import result_file, single_run
 from gsopt.benchmark.suite.definition import Case, Suite
+from gsopt.benchmark.suite.estimate import estimate
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.events import Report
 from gsopt.farm.job import Farm, Job
@@ -34,22 +36,9 @@ def run_suite(
     Without a farm, one run follows the other on this machine. Only this process writes the file. Raises UsageError and
     InputError for a file of another suite or a broken one, before anything is run.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with result_file.locked(path):
-        document = result_file.opened(path, suite, command)
-        context.work.mkdir(parents=True, exist_ok=True)
-        for stale in context.work.glob("run-*"):  # of a killed call
-            shutil.rmtree(stale, ignore_errors=True)
-        failed: list[str] = []
-        jobs: list[Job] = []
-        for case in cases:
-            try:
-                document, job = _prepared(path, document, case, context)
-            except RunFailed as error:
-                report(f"{case.id} failed: {error}")
-                failed.append(case.id)
-            else:
-                jobs += [job] if job else []
+    with _opened(path, suite, command, context) as document:
+        document, due, failed = _due(path, document, cases, context, report)
+        jobs = [job for _, job in due]
         for number, outcome in enumerate((farm or LocalFarm(context.threads)).run(jobs), 1):
             if outcome.ending == "done":
                 document = _written(path, document, outcome.answer)
@@ -59,6 +48,46 @@ def run_suite(
                 failed.append(outcome.job.name)
             report(f"{number}/{len(jobs)} {message}")
         return failed
+
+
+def estimate_suite(
+    path: Path, suite: Suite, command: str, cases: Sequence[Case], context: SuiteContext, report: Report
+) -> list[str]:
+    """Reports what the runs without a record will take, makes none of them, and returns those that cannot be made."""
+    with _opened(path, suite, command, context) as document:
+        _, due, failed = _due(path, document, cases, context, report)
+        for message in estimate([case for case, _ in due], context):
+            report(message)
+        return failed
+
+
+@contextmanager
+def _opened(path: Path, suite: Suite, command: str, context: SuiteContext) -> Iterator[dict[str, Any]]:
+    """The result file, this process's alone, and an empty folder for the runs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with result_file.locked(path):
+        document = result_file.opened(path, suite, command)
+        context.work.mkdir(parents=True, exist_ok=True)
+        for stale in context.work.glob("run-*"):  # of a killed call
+            shutil.rmtree(stale, ignore_errors=True)
+        yield document
+
+
+def _due(
+    path: Path, document: dict[str, Any], cases: Sequence[Case], context: SuiteContext, report: Report
+) -> tuple[dict[str, Any], list[tuple[Case, Job]], list[str]]:
+    """(document, runs that have no record yet, ids of those that cannot be made)."""
+    due: list[tuple[Case, Job]] = []
+    failed: list[str] = []
+    for case in cases:
+        try:
+            document, job = _prepared(path, document, case, context)
+        except RunFailed as error:
+            report(f"{case.id} failed: {error}")
+            failed.append(case.id)
+        else:
+            due += [(case, job)] if job else []
+    return document, due, failed
 
 
 def _prepared(
