@@ -32,7 +32,11 @@ DOMAINS = [
     ("own", "Own", "A template of your own"),
 ]
 PRIORS = [
-    ("auto", "As gsopt Decides", "The embedded prior where prompts or images ask for one, else none"),
+    (
+        "auto",
+        "As gsopt Decides",
+        "One photo: the shape library. Else the embedded prior where prompts or images ask for one",
+    ),
     ("off", "Off", "Photos alone decide"),
     ("embedded", "Embedded", "The small prior that comes with gsopt"),
     ("sd21", "Stable Diffusion 2.1", "The community's copy, downloaded by diffusers"),

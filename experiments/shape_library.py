@@ -1,11 +1,14 @@
 """What is a shape library worth where one photo shows an object: with words, with wrong words, without?
 
     python experiments/shape_library.py SCENES... [-o FILE.json] [--seeds 1] [--jobs 2]
+    python experiments/shape_library.py SCENES... --arms template "language model" --llm URL --model NAME
 
 SCENES are posed scenes of objects with alpha and held-out views, or folders of them. A seed is a choice of the photo,
-as in few_photos.py. Six arms see the same photo: not inflated, inflated (the rules), the library with the object's
-name, with the name of another thing, without words, and without words or entries that a word for the object finds.
-Runs that have a record in FILE are not made again. The table (held-out PSNR and LPIPS over the rules) is printed.
+as in few_photos.py. The arms see the same photo: not inflated, inflated (the rules), the library with the object's
+name, with the name of another thing, without words, without words or entries that a word for the object finds, and
+with the prompts that the template or a language model makes of an expert's notes (suite_notes.json; the template steps
+in where the model writes nothing usable). Prompts are written once per object. Runs that have a record in FILE are not
+made again. The table (held-out PSNR and LPIPS over the rules) is printed.
 """
 
 from __future__ import annotations
@@ -29,7 +32,10 @@ from gsopt.shape_library.words import word_scores
 
 RESULT = Path(__file__).parent / "results" / "shape_library.json"
 RIGHT, WRONG, SILENT, NONE_LEFT = "right words", "wrong words", "no words", "no words, category taken out"
-ARMS = ("photo alone", "rules", RIGHT, WRONG, SILENT, NONE_LEFT)
+TEMPLATE, MODEL = "template", "language model"
+ARMS = ("photo alone", "rules", RIGHT, WRONG, SILENT, NONE_LEFT, TEMPLATE, MODEL)
+NOTES = Path(__file__).parent / "suite_notes.json"
+SMALL_MODELS = Path(__file__).parents[1] / "docs" / "howto" / "prompts" / "small-models.md"
 METRICS = ("psnr", "ssim", "lpips_alex")
 WORDS = {
     "bonsai-tree": ("a bonsai tree", "a chair"),
@@ -60,12 +66,26 @@ WORDS = {
 """Each object's name, as anybody would say it, and the name of another thing; written before any run."""
 
 
-def flags(arm: str, scene: str, folder: Path) -> list[str]:
+def written_prompts(arm: str, scene: str, options: argparse.Namespace) -> Path:
+    """The prompts of an arm for an object, written by its first run."""
+    path: Path = options.prompts / f"{scene}-{arm.replace(' ', '-')}.json"
+    if not path.exists():
+        notes = json.loads(NOTES.read_text())[f"objects/{scene}"]["notes"]
+        command = [sys.executable, "-m", "gsopt", "prompts", "--notes", notes, "--prior", "library", "-o", str(path)]
+        asked = ["--llm", options.llm, "--model", options.model, "--timeout", "900", "--fallback"]
+        asked += ["--domain", str(SMALL_MODELS), "-n", "3", "--negatives", "0"]
+        subprocess.run([*command, *(asked if arm == MODEL else [])], check=True, stdout=subprocess.DEVNULL)
+    return path
+
+
+def flags(arm: str, scene: str, folder: Path, options: argparse.Namespace) -> list[str]:
     """The flags of an arm."""
     if arm == "photo alone":
         return ["--sparse.inflate", "off", "--lambda_sds", "0"]
     if arm == "rules":
         return ["--lambda_sds", "0"]
+    if arm in (TEMPLATE, MODEL):
+        return ["--prior", "library", "--prompts", str(written_prompts(arm, scene, options))]
     right, wrong = WORDS[scene]
     prior = "library" if arm != NONE_LEFT else f"library:{without(right, folder)}"
     words = {RIGHT: ["--prompt", right], WRONG: ["--prompt", wrong]}.get(arm, [])
@@ -83,13 +103,13 @@ def without(words: str, folder: Path) -> Path:
     return out
 
 
-def run(scene: Path, seed: int, arm: str) -> dict[str, Any]:
+def run(scene: Path, seed: int, arm: str, options: argparse.Namespace) -> dict[str, Any]:
     """One run in a process of its own, and its held-out figures."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command = [sys.executable, "-m", "gsopt", "train", str(scene), "-m", f"{folder}/run", "--threads", "1"]
         command += ["--view-ids", str(photos(scene, 1, seed)[0]), "--seed", str(seed), "--checkpoint-every", "0"]
-        command += ["--preview-every", "0", *flags(arm, scene.name, folder)]
+        command += ["--preview-every", "0", *flags(arm, scene.name, folder, options)]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         metrics = json.loads((folder / "run" / "metrics.json").read_text())
         config = json.loads((folder / "run" / "config.json").read_text())
@@ -136,14 +156,18 @@ def main() -> None:
     parser.add_argument("-o", type=Path, default=RESULT)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--arms", nargs="*", choices=ARMS, default=ARMS)
+    parser.add_argument("--arms", nargs="*", choices=ARMS, default=ARMS[:6])
+    parser.add_argument("--prompts", type=Path, default=Path("build/prompts"))
+    parser.add_argument("--llm", default="")
+    parser.add_argument("--model", default="")
     options = parser.parse_args()
+    options.prompts.mkdir(parents=True, exist_ok=True)
     document = json.loads(options.o.read_text()) if options.o.exists() else {"runs": []}
     known = {(one["scene"], one["seed"], one["arm"]) for one in document["runs"]}
     wanted = [(s, seed, arm) for seed in range(options.seeds) for arm in options.arms for s in scenes(options.scenes)]
     with ThreadPoolExecutor(options.jobs) as pool:
         missing = [one for one in wanted if (one[0].name, *one[1:]) not in known]
-        for record in pool.map(lambda one: run(*one), missing):
+        for record in pool.map(lambda one: run(*one, options), missing):
             document["runs"].append(record)
             write_atomic(options.o, to_json({**document, "machine": machine()}))
     print(table(document["runs"]))

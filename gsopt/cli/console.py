@@ -128,7 +128,7 @@ def started_line(event: Mapping[str, Any], run: Path) -> str:
     if turns := event.get("turns"):
         few += f", the same after every of {turns + 1} turns about an axis: every view counts from {turns} more sides"
     if guessed := event.get("guessed"):
-        few += f", one photo: {guessed} guessed views of its inflated silhouette"
+        few += f", one photo: {guessed} guessed views of the body it suggests"
     begin = f"resumed at step {event['step']}" if event["step"] else f"init {event['init']}"
     return f"backend {event['backend']} | {views}{few} | {begin} | {event['n']:,} Gaussians | {run}"
 

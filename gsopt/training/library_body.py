@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from gsopt.config.guidance import GuidanceConfig, library_of
+from gsopt.config.guidance import GuidanceConfig, chooses_itself, library_of
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.events import to_json, write_atomic
@@ -35,15 +35,17 @@ def require_library(config: GuidanceConfig) -> None:
 
 
 def with_library_body(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> Scene:
-    """The scene with the body that `--prior library` finds for its photo; else as it is."""
-    named = library_of(config.guidance.prior)
-    if named is None:
+    """The scene with the body that a library finds for its only photo, the bundled one where no prior or weight is
+    given (docs/decisions/0021-library-by-default.md); else as it is."""
+    asked = library_of(config.guidance.prior)
+    if asked is None and not chooses_itself(config.guidance):
         return scene
     if len(scene.train) != 1 or not scene.has_alpha or scene.mirrored or not guesses(config, 1):
-        directory.warn(unused(scene))
+        if asked is not None:
+            directory.warn(unused(scene))
         return scene
     began = time.process_time()
-    library = _opened(named, directory)
+    library = _opened(asked or "", directory)
     texts = expert_texts(config.guidance)
     found = completion(small_photos(scene.train, 1)[0], scene.extent, library, texts)
     if found is None:

@@ -93,7 +93,7 @@ def train(
             scene, repaired = load_with_agreeing_masks(config.data)
             require_readable(scene.test)
             scene = with_recorded_mirrors(config, scene, directory)
-            if config.guidance != GuidanceConfig():
+            if config.guidance != GuidanceConfig() or len(scene.train) == 1:
                 scene = _with_prior_body(config, scene, backend, directory)
             if guesses(config, len(scene.train)) and not scene.mirrored:
                 scene = with_guessed_views(scene, backend)

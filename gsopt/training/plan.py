@@ -145,7 +145,7 @@ class RunPlan:
             density=density_plan(config.density, budget, sparse, scene.extent),
             poses=config.poses,
             exposure=config.exposure,
-            prior=select_prior(config.guidance),
+            prior=select_prior(config.guidance, completed=scene.body is not None),
             guidance=GuidancePlans.of(config.guidance, iterations, config.seed, background),
             extra_per_epoch=extra_per_epoch(scene),
             target_cache_mb=TARGET_CACHE_SHARE * config.data.cache_mb,

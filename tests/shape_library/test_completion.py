@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,12 @@ from gsopt.data.scene import load_scene
 from gsopt.geometry.voxels import Grid
 from gsopt.init.inflation import inflated
 from gsopt.init.thumbnails import Thumbnail, small_photos
-from gsopt.shape_library.alignment import aligned, boxed, soft
+from gsopt.shape_library.alignment import Alignments, agreement_and_slope, aligned, boxed, soft
 from gsopt.shape_library.completion import MAX_SHAPES, _compared, completion
 from gsopt.shape_library.entry import Shape
 from gsopt.shape_library.library_file import ShapeLibrary
 from gsopt.shape_library.outline import Outline
-from gsopt.shape_library.poses import best_poses, surface_points, turn_matrix
+from gsopt.shape_library.poses import Poses, best_poses, surface_points, turn_matrix
 from gsopt.shape_library.words import word_scores
 
 SIZE = 96
@@ -84,6 +85,27 @@ def test_the_turn_and_the_scale_of_a_shape_are_found_again(
     assert min(abs(turn - 0.6), abs(turn - (3.14159 - 0.6))) < 0.15
     assert seen.size * float(found.parameters[best, 1].exp()) == pytest.approx(1.5, rel=0.12)
     assert float(found.agreement[best]) > float(boxed_agreement(seen, start, occupied, sizes).max()) - 1e-6
+
+
+def test_the_slope_of_the_agreement_is_a_central_difference(outline: Outline) -> None:
+    generator = torch.Generator().manual_seed(3)
+    volumes = torch.nn.functional.avg_pool3d(torch.rand(2, 1, 14, 14, 14, generator=generator), 5, 1, 2).double()
+    exact = replace(outline, **{name: getattr(outline, name).double() for name in ("alpha", "middle", "upright")})
+    poses = Poses(torch.zeros(2, dtype=torch.long), torch.zeros(2), torch.tensor([1.0, -1.0]), torch.zeros(2))
+    first = torch.tensor([[0.3, -0.1, 0.2, 0.05, -0.03]]).repeat(2, 1).double()
+    start = Alignments(poses, first - 0.04, torch.zeros(2))
+    points, alpha = outline.rays(16, 12)
+    rays, alpha, sizes = points.flatten(0, 1).double(), alpha.flatten().double(), torch.ones(2, 3).double()
+
+    def agreement(parameters: torch.Tensor) -> torch.Tensor:
+        return agreement_and_slope(exact, start, volumes, sizes, parameters, rays, alpha)[0]
+
+    slope = agreement_and_slope(exact, start, volumes, sizes, first, rays, alpha)[1]
+    for column in range(5):
+        step = torch.zeros_like(first)
+        step[:, column] = 1e-6
+        difference = (agreement(first + step) - agreement(first - step)) / 2e-6
+        assert torch.allclose(slope[:, column], difference, rtol=1e-4, atol=1e-6)
 
 
 def boxed_agreement(seen: Outline, start: object, occupied: torch.Tensor, sizes: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ from gsopt.errors import InputError
 from gsopt.events import read_events
 from gsopt.results.report.library_section import library_section
 from gsopt.sds.prompts import Prompt, PromptSet, write_set
-from gsopt.sds.select_prior import select_prior
+from gsopt.sds.select_prior import LIBRARY, NOT_ASKED, select_prior
 from gsopt.shape_library.library_file import BUNDLED, ShapeLibrary
 from gsopt.training.library_body import expert_texts, require_library
 from gsopt.training.loop import train
@@ -84,10 +84,31 @@ def test_the_body_of_the_library_is_the_one_that_a_run_learns_from(one_photo: Pa
     result = train(config_of(one_photo, iterations=20), tmp_path / "again")
     assert result.scene.body is not None
     assert result.scene.guessed
-    plain = train(replace(config_of(one_photo), guidance=GuidanceConfig()), tmp_path / "plain")
+    plain = train(replace(config_of(one_photo), guidance=GuidanceConfig(lambda_sds=0)), tmp_path / "plain")
     assert plain.scene.body is None
     same, other = ((folder / "splat.ply").read_bytes() for folder in (tmp_path / "again", tmp_path / "plain"))
     assert (run / "splat.ply").read_bytes() == same != other
+
+
+def test_one_photo_takes_the_bundled_library_where_nobody_names_a_prior(
+    one_photo: Path, run: Path, tmp_path: Path
+) -> None:
+    words = GuidanceConfig(prompt=("a soccer ball",))
+    assert train(replace(config_of(one_photo), guidance=words), tmp_path / "words").scene.body is not None
+    assert (tmp_path / "words" / "splat.ply").read_bytes() == (run / "splat.ply").read_bytes()
+    silent = train(replace(config_of(one_photo), guidance=GuidanceConfig()), tmp_path / "silent")
+    assert silent.scene.body is not None
+    recorded = json.loads((tmp_path / "silent" / "config.json").read_text())
+    assert recorded["library"]["texts"] == []
+    assert recorded["guidance"] == {"prior": None, "lambda_sds": 0.0, "reason": LIBRARY}
+
+
+def test_several_photos_take_no_library_by_themselves_and_no_warning(tmp_path: Path) -> None:
+    scene = write_balls(tmp_path / "two", BALL, ring(2, size=48))
+    result = train(replace(config_of(scene), guidance=GuidanceConfig()), tmp_path / "run")
+    assert result.scene.body is None
+    assert not any("library" in str(event["message"]) for event in events_of(result.run, "warning"))
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["guidance"]["reason"] == NOT_ASKED
 
 
 def test_a_library_leaves_several_photos_alone_and_says_so(tmp_path: Path) -> None:
