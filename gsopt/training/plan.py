@@ -174,7 +174,7 @@ def near_distance(scene: Scene) -> float:
 
 
 def guesses(config: TrainConfig, views: int) -> bool:
-    """True when a single photo is completed by views of its inflated silhouette."""
+    """True when a single photo is completed by views of the body that it suggests."""
     return config.sparse.inflate == "auto" and is_sparse(config.sparse, views) and not config.poses.refine
 
 
