@@ -12,6 +12,7 @@ import errno
 import glob
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -27,6 +28,9 @@ LARGEST_METRICS = 64 << 20
 LAST = ("done", "stopped", "error")
 WRITTEN_IN_PLACE = ("events.jsonl", "log.txt", "previews", "checkpoints", "guidance", "frames", "renders")
 """Files that are appended to and folders that are written into; every other file is replaced as a whole."""
+
+TEMPORARY = re.compile(r"\..+\.\d+\.tmp|\.tmp\w{6}")
+"""Names of files before they are whole: a dot, the name, the process; and what safetensors takes."""
 
 _APPEND = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)  # Windows lacks the last one
 
@@ -74,6 +78,14 @@ def create(temporary: Path) -> BinaryIO:
             if writer_is_dead(other):
                 other.unlink(missing_ok=True)
     return open(temporary, "xb")
+
+
+def sweep(*folders: Path) -> None:
+    """Removes what a killed writer left half done. The caller knows that nobody else is writing there."""
+    for folder in folders:
+        for file in folder.iterdir():
+            if TEMPORARY.fullmatch(file.name):
+                file.unlink(missing_ok=True)
 
 
 def writer_is_dead(temporary: Path) -> bool:

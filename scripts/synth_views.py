@@ -32,7 +32,7 @@ from synth.settings import Engine, Layout, Lighting, Normalize, Settings
 from synth.worker_pool import serve
 
 from gsopt import check
-from gsopt.errors import GsoptError, UsageError
+from gsopt.errors import GsoptError, InputError, UsageError, refused
 from gsopt.farm.open import available_cores, open_farm
 
 INTERRUPTED = 130
@@ -160,6 +160,9 @@ def main(argv: Sequence[str]) -> int:
     except GsoptError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
+    except OSError as error:
+        print(f"error: {refused(error)} The same command with --resume goes on.", file=sys.stderr)
+        return InputError.exit_code
     except KeyboardInterrupt:
         print("Interrupted. The same command with --resume goes on.", file=sys.stderr)
         return INTERRUPTED

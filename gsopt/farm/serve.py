@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from gsopt.errors import GsoptError
+from gsopt.errors import GsoptError, refused
 
 ANSWER = "gsopt answers "
 """Begins the line that ends a job."""
@@ -35,6 +35,8 @@ def serve(handle: Callable[[dict[str, Any]], Any]) -> NoReturn:
             answer = {"answer": handle(request)}
         except GsoptError as error:
             answer = {"error": str(error)}
+        except OSError as error:
+            answer = {"error": refused(error)}
         except Exception as error:  # a defect of ours: printed, reported, and the next job gets its turn
             traceback.print_exc()
             answer = {"error": f"{type(error).__name__}: {error}. The log has the traceback; please report it."}

@@ -8,8 +8,7 @@ from typing import Any
 
 from gsopt.data.files import read_json
 from gsopt.errors import InputError
-from gsopt.events import to_json, write_atomic
-from gsopt.training.run_directory import TEMPORARY, sweep
+from gsopt.events import TEMPORARY, sweep, to_json, write_atomic
 
 
 def claim(path: Path, plan: dict[str, Any], kind: str, inputs: str, beside: str = "") -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 from gsopt._version import __version__
 from gsopt.config.train import TrainConfig
 from gsopt.errors import GsoptError, InputError, UsageError, refused, shortened
-from gsopt.events import EventWriter, refuse_links, to_json, write_atomic
+from gsopt.events import EventWriter, refuse_links, sweep, to_json, write_atomic
 
 Listener = Callable[[Mapping[str, Any]], None]
 
@@ -31,8 +30,6 @@ WORK = (
 # Settings that may differ when a run is resumed: they do not change a bit of the result, but for backend and device, of
 # which each has bits of its own: a run must not be lost with its GPU.
 FREE = ("threads", "max_memory", "checkpoint_every", "preview_every", "data.cache_mb", "backend", "device")
-# Names of files before they are whole: a dot, the name, the process; and what safetensors takes.
-TEMPORARY = re.compile(r"\..+\.\d+\.tmp|\.tmp\w{6}")
 PACKAGES = ("torch", "numpy", "pillow", "safetensors")
 
 
@@ -83,6 +80,7 @@ def opened(path: Path, config: TrainConfig, resume: bool, listener: Listener | N
         run.previews.mkdir(exist_ok=True)
         run.checkpoints.mkdir(exist_ok=True)
         folders = ("previews", "checkpoints", "guidance", "renders/test", "renders/train")
+        # The lock is held: nobody else is writing.
         sweep(path, *(path / name for name in folders if (path / name).is_dir()))
         yield run
     except BaseException as error:
@@ -110,14 +108,6 @@ def refuse_another_run(path: Path) -> None:
 def work_in(path: Path) -> Path | None:
     """The first thing found in a folder that a new run would overwrite, or None."""
     return next((found for pattern in WORK for found in sorted(path.glob(pattern))), None)
-
-
-def sweep(*folders: Path) -> None:
-    """Remove what a killed writer left half done. The lock is held: nobody else is writing."""
-    for folder in folders:
-        for file in folder.iterdir():
-            if TEMPORARY.fullmatch(file.name):
-                file.unlink(missing_ok=True)
 
 
 def versions() -> dict[str, str]:

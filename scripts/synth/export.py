@@ -55,7 +55,11 @@ def export(
 
 
 def write_json(path: Path, content: Any) -> None:
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json_text(content), encoding="utf-8")
+
+
+def json_text(content: Any) -> str:
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
 def transforms(folder: Path, settings: Settings, views: Sequence[Shot], suffix: str) -> dict[str, Any]:

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.errors import InputError
+from gsopt.events import TEMPORARY, write_atomic
+from gsopt.events import sweep as sweep_files
 from gsopt.farm.job import PARTIAL, Farm, Outcome
 from gsopt.farm.local import LocalFarm
 from synth.cameras import shots
-from synth.export import write_json
+from synth.export import json_text
 from synth.mesh_items import Item
 from synth.render_object import RECORD
 from synth.settings import Settings
@@ -64,9 +66,9 @@ def run(
     finally:
         known = {item.id: item for item in todo}
         failures += [failure(known[o.job.name], reason(o)) for o in outcomes if o.ending != "done"]
-        write_whole(out / FAILURES, sorted(failures, key=lambda f: str(f["id"])))
-        write_whole(out / DATASET, header | {"objects": sorted(records(out), key=lambda r: str(r["id"]))})
-        write_whole(out / TIMINGS, timings(outcomes, time.perf_counter() - began))
+        write_record(out / FAILURES, sorted(failures, key=lambda f: str(f["id"])))
+        write_record(out / DATASET, header | {"objects": sorted(records(out), key=lambda r: str(r["id"]))})
+        write_record(out / TIMINGS, timings(outcomes, time.perf_counter() - began))
     report(f"{len(items) - len(failures)} of {len(items)} objects are in {out}")
     for lost in failures:
         report(f"failed: {lost['id']}: {lost['reason']}")
@@ -96,18 +98,19 @@ def open_folder(out: Path, header: dict[str, Any], resume: bool) -> None:
     """Make `out`, or make sure that it belongs to this run; then remove what a killed run left half written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        occupied = any(out.iterdir())
+        occupied = any(not TEMPORARY.fullmatch(path.name) for path in out.iterdir())  # of a run killed at its start
         if occupied:
             check_same_run(out, header, resume)
-            sweep(out)
-        else:
-            write_whole(out / DATASET, header | {"objects": []})
+        sweep(out)
+        if not occupied:
+            write_record(out / DATASET, header | {"objects": []})
     except OSError as error:
         raise InputError(f"Cannot use the output folder {out}: {error.strerror}. Choose another -o.") from None
 
 
 def sweep(out: Path, tries: int = 20) -> None:
-    """Remove half-written folders. A worker whose run was just killed may still write: then once more."""
+    """Remove half-written files and folders. A worker whose run was just killed may still write: then once more."""
+    sweep_files(out)
     for partial in list(out.rglob(PARTIAL + "*")):
         for _ in range(tries):
             shutil.rmtree(partial, ignore_errors=True)
@@ -176,8 +179,6 @@ def line_about(outcome: Outcome) -> str:
     return f"{outcome.job.name}: {sum(outcome.answer.values()):.1f} s{warnings}"
 
 
-def write_whole(path: Path, content: Any) -> None:
-    """Write beside, then rename: a reader sees the old file or the new one."""
-    beside = path.with_name(f".{path.name}.new")
-    write_json(beside, content)
-    beside.replace(path)
+def write_record(path: Path, content: Any) -> None:
+    """Write a whole file of the run, or leave the old one and raise InputError."""
+    write_atomic(path, json_text(content).encode())

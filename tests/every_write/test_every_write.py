@@ -6,6 +6,7 @@ every fault, or, for a work of many calls, with one of the faults in turn.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shlex
@@ -19,10 +20,10 @@ import textured_room as room
 from faulty_disk import FAULTS, Fault, FaultyDisk, compiler, faulty_disk
 from tiny_scenes import cloud, write_dataset
 
-from gsopt.events import read_events
+from gsopt.events import TEMPORARY, read_events
+from gsopt.farm.job import PARTIAL
 from gsopt.formats import load_splats, save_splats
 from gsopt.training.checkpoint import load_newest
-from gsopt.training.run_directory import TEMPORARY
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs Linux and a C compiler")
 
@@ -61,7 +62,10 @@ def same_command(folder: Path) -> list[str]:
 def named(*patterns: str) -> Callable[[Path], Files]:
     """A reader of the files of these names."""
     return lambda folder: {
-        str(path.relative_to(folder)): path.read_bytes() for name in patterns for path in sorted(folder.glob(name))
+        str(path.relative_to(folder)): path.read_bytes()
+        for name in patterns
+        for path in sorted(folder.glob(name))
+        if path.is_file()
     }
 
 
@@ -91,6 +95,16 @@ def whole_or_absent(folder: Path) -> None:
     assert not (folder / "scene").exists() or (folder / "scene" / "sfm.json").exists()
 
 
+def objects_are_whole(folder: Path) -> None:
+    """An object's folder is there with its record and all files that this lists, or not at all."""
+    for made in (folder / "out").glob("[!.]*/"):
+        record = json.loads((made / "object.json").read_text())
+        digest = hashlib.sha256()
+        for path in sorted(path for path in made.rglob("*") if path.is_file() and path.name != "object.json"):
+            digest.update(path.relative_to(made).as_posix().encode() + b"\0" + path.read_bytes())
+        assert digest.hexdigest() == record["files_sha256"], f"{made.name} is not what was rendered"
+
+
 def figures(folder: Path) -> Files:
     """What a suite measured, without times and memory."""
     document = json.loads((folder / "found.json").read_text()) if (folder / "found.json").exists() else {"runs": []}
@@ -103,6 +117,7 @@ def works(inputs: Path) -> dict[str, Work]:
     sfm = shlex.split("--features sift --max-features 250 --max-size 200 --threads 1")
     finetune = shlex.split("--val two --fits 1 --size 64 --steps 2 --batch 2 --threads 1")
     train = shlex.split("--init random --init-count 60 --iterations 20 --preview-every 5 --lambda-sds 0 --threads 1")
+    synth = shlex.split("--views 2 --test-views 1 --resolution 8 --samples 1 --points 20 --depth --masks --threads 1")
     suite = ["--suite", str(inputs / "one.toml"), "--root", str(scenes), "--seeds", "1"]
     train += ["--checkpoint-every", str(CHECKPOINT_EVERY)]
     return {
@@ -146,10 +161,23 @@ def works(inputs: Path) -> dict[str, Work]:
             slow=True,
             has_child=True,
         ),
+        "synth_views": Work(
+            lambda folder: [SYNTH_VIEWS, str(inputs / "meshes"), "-o", str(folder / "out"), *synth],
+            lambda folder: ["--resume"],
+            lambda folder: {name: data for name, data in named("out/**/*")(folder).items() if name not in NOT_SAME},
+            nothing,
+            objects_are_whole,
+            slow=True,
+            has_child=True,
+        ),
     }
 
 
-NAMES = ("train", "export", "sfm", "finetune", "suite")
+NAMES = ("train", "export", "sfm", "finetune", "suite", "synth_views")
+SYNTH_VIEWS = str(Path(__file__).resolve().parents[2] / "scripts" / "synth_views.py")
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+NOT_SAME = ("out/timings.json", "out/log.txt")
+"""Files that depend on the course of a run."""
 SUITE = """
 title = "One"
 about = "One run."
@@ -180,6 +208,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_dataset(folder / "scenes" / "two", train=6)
         room.photograph(folder / "photos", room.arc(3, spread=14.0))
         (folder / "one.toml").write_text(SUITE)
+        (folder / "meshes").mkdir()
+        for name in ("a", "b"):
+            (folder / "meshes" / f"{name}.obj").write_text(TETRAHEDRON)
     return folder
 
 
@@ -240,5 +271,6 @@ def survives(work: Work, disk: FaultyDisk, fault: Fault, at: int, folder: Path, 
 
 
 def strays(folder: Path) -> list[str]:
-    """Names of half-written files."""
-    return [str(path.relative_to(folder)) for path in folder.rglob("*") if TEMPORARY.fullmatch(path.name)]
+    """Names of half-written files and folders."""
+    half = (path for path in folder.rglob("*") if TEMPORARY.fullmatch(path.name) or path.name.startswith(PARTIAL))
+    return [str(path.relative_to(folder)) for path in half]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -16,6 +17,11 @@ from gsopt.farm.job import Job
 from gsopt.farm.serve import serve
 
 MEGABYTE = 1 << 20
+ERRORS = {
+    "bad": InputError("It is bad. Mend it."),
+    "defect": ZeroDivisionError("an oversight"),
+    "full": OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+}
 SLEEPER = "import time; time.sleep(600)"
 
 
@@ -32,10 +38,8 @@ def handle(request: dict[str, Any]) -> Any:
         child = subprocess.Popen([sys.executable, "-c", SLEEPER])
         Path(pids).write_text(f"{os.getpid()} {child.pid}")
     match request["what"]:
-        case "bad":
-            raise InputError("It is bad. Mend it.")
-        case "defect":
-            raise ZeroDivisionError("an oversight")
+        case "bad" | "defect" | "full" as way:
+            raise ERRORS[way]
         case "die":
             os._exit(7)
         case "hang":

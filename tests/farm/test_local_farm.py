@@ -54,12 +54,14 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def test_what_goes_wrong_is_named_and_costs_one_job(tmp_path: Path) -> None:
-    ways = ("work", "bad", "defect", "die", "late death", "work")
+    ways = ("work", "bad", "defect", "die", "late death", "work", "full")
     jobs = [job(f"{n} {way}", way, tmp_path / f"{n} {way}") for n, way in enumerate(ways)]
     found = by_name(LocalFarm(2), *jobs)
-    assert [found[one.name].ending for one in jobs] == ["done", "failed", "failed", "died", "died", "done"]
+    assert [found[one.name].ending for one in jobs] == ["done", "failed", "failed", "died", "died", "done", "failed"]
     assert found["1 bad"].error == "It is bad. Mend it."
     assert "ZeroDivisionError: an oversight" in found["2 defect"].error
+    assert "No space left" in found["6 full"].error
+    assert "report" not in found["6 full"].error, "a full disk is no defect of ours"
     assert "exit code 7" in found["3 die"].error
     assert "talks about 3 die" in found["3 die"].output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0 work", "5 work"]

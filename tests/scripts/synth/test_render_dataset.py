@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -34,6 +35,7 @@ PRETENDER = """
     print("Blender talks", flush=True)
     def handle(request):
         item, settings, seed, out = read_request(request)
+        print("Blender renders", flush=True)
         with open({calls!r}, "a") as calls:
             calls.write(item.id + "\\n")
         text = item.mesh.read_text()
@@ -169,6 +171,42 @@ def test_what_a_killed_run_left_half_written_is_swept_away(calls: Path, tmp_path
     (tmp_path / "out" / f"{PARTIAL}123-b" / "half.png").touch()
     assert run(items, SETTINGS, 0, tmp_path / "out", resume=True) == 0
     assert not list((tmp_path / "out").rglob(PARTIAL + "*"))
+
+
+def test_a_run_killed_at_its_first_write_goes_on(calls: Path, tmp_path: Path) -> None:
+    out, items = tmp_path / "out", meshes(tmp_path, a="x")
+    out.mkdir()
+    (out / ".dataset.json.2147483646.tmp").write_text("{")
+    assert run(items, SETTINGS, 0, out, resume=True) == 0
+    assert [o["id"] for o in read(out / "dataset.json")["objects"]] == ["a"]
+    (out / ".failures.json.2147483646.tmp").write_text("[")
+    assert run(items, SETTINGS, 0, out, resume=True) == 0
+    assert {path.name for path in out.iterdir()} == {"a", "dataset.json", "failures.json", "timings.json", "log.txt"}
+
+
+def full_disk(descriptor: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("full", ["log.txt", "folder"])
+def test_a_full_disk_ends_the_run_in_one_line(
+    full: str, calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(synth_views, "require_blender", lambda: None)
+    monkeypatch.setattr(synth_views.signal, "signal", lambda *_: None)
+    meshes(tmp_path, a="x")
+    command = ["x.py", str(tmp_path / "a.obj"), "-o", str(tmp_path / "out"), "--threads", "1", "--resume"]
+    assert synth_views.main(command) == 0
+    capsys.readouterr()
+    if full == "log.txt":
+        (tmp_path / "out" / "log.txt").unlink()
+        (tmp_path / "out" / "log.txt").symlink_to("/dev/full")
+        (tmp_path / "out" / "a").rename(tmp_path / "away")
+    else:
+        monkeypatch.setattr(os, "fsync", full_disk)
+    assert synth_views.main(command) == 3
+    assert "No space left" in capsys.readouterr().err
 
 
 def test_an_interrupted_run_records_what_it_has(calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
