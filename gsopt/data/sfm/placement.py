@@ -75,9 +75,11 @@ def common_focus(
 def rotation_to_z(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes the unit vector `up` to +z (Rodrigues)."""
     z = np.array([0.0, 0.0, 1.0])
-    cosine = float(up @ z)
-    if cosine < -1 + 1e-9:
+    cosine, squared_sine = float(up @ z), float(up[0] ** 2 + up[1] ** 2)
+    if cosine < 0 and squared_sine < 1e-300:
         return np.diag([1.0, -1.0, -1.0])
     x, y, w = np.cross(up, z)
     cross = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+    # Equal, each exact where the other cancels.
+    share = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / squared_sine
+    return np.eye(3) + cross + share * cross @ cross

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -41,6 +41,8 @@ def viewmats(centers: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 @given(DIRECTIONS)
+@example([0.0, 1.192092896e-07, -1.0])
+@example([1e-200, 0.0, -1.0])
 def test_up_is_turned_to_z_by_the_smallest_rotation(direction: list[float]) -> None:
     up = np.array(direction) / np.linalg.norm(direction)
     rotation = placement.rotation_to_z(up)
