@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ksplat_files import ksplat
 from splat_laws import reads_or_refuses
-from splat_samples import ksplat, make_splats
+from splat_samples import make_splats
 
 from gsopt.errors import InputError
 from gsopt.formats import load_splats, save_splats

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from splat_samples import ksplat, make_splats
+from ksplat_files import ksplat
+from splat_samples import make_splats
 
 from gsopt.cli import main
 from gsopt.errors import InputError

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ksplat_files import ksplat
 from splat_laws import reads_or_refuses, require_short
 from tiny_scenes import cloud, write_dataset
 
@@ -73,6 +74,19 @@ def follow(path: Path) -> object:
     return Follower(path.parent).poll()
 
 
+def padded_ksplat(path: Path) -> None:
+    """This target fills the headers of a .ksplat up with zeros, 5 kB that no reader looks at, and reads that."""
+    data = path.read_bytes()
+    whole = path.with_name("a.ksplat")
+    whole.write_bytes(data[:48].ljust(4096, b"\0") + data[48:96].ljust(1024, b"\0") + data[96:])
+    reads_or_refuses(whole)
+
+
+def short_ksplats(folder: Path) -> list[bytes]:
+    """Files of every level of compression, without the empty part of their headers."""
+    return [whole[:48] + whole[4096:4144] + whole[5120:] for whole in (ksplat(level, 3, 1) for level in range(3))]
+
+
 def saved(suffix: str) -> Callable[[Path], list[bytes]]:
     def seeds(folder: Path) -> list[bytes]:
         path = folder / f"seed{suffix}"
@@ -131,6 +145,7 @@ CONFIG = json.dumps({"config": TrainConfig().to_dict()}).encode()
 
 TARGETS = {
     **{f"splats{suffix}": Target(f"a{suffix}", reads_or_refuses, saved(suffix)) for suffix in SUFFIXES},
+    "splats.ksplat": Target("short.ksplat", padded_ksplat, short_ksplats),
     "points.ply": Target("points.ply", clear(pointcloud.read_points_ply), saved(".ply")),
     "transforms.json": Target(
         "transforms_train.json",
