@@ -164,6 +164,18 @@ def test_an_outlier_is_six_median_distances_out_or_twenty_median_sizes_large() -
         assert np.array_equal(Filter(without_outliers=True).keeps(line), ~outliers(line))
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3, 1e6])
+def test_outliers_do_not_depend_on_the_unit_of_the_scene(unit: float) -> None:
+    cloud = random_splats(200)
+    cloud.positions[:20] *= 50
+    cloud.scales[20:40] *= 200
+    in_scene_units = outliers(cloud)
+    assert 20 < in_scene_units.sum() < 60
+    cloud.positions[:] *= unit
+    cloud.scales[:] *= unit
+    assert np.array_equal(outliers(cloud), in_scene_units)
+
+
 def test_a_summary_is_that_of_numpy() -> None:
     cloud = replace(random_splats(1000), left_out=3)
     found = summary(cloud)

@@ -181,6 +181,24 @@ def test_spz_means_the_same_as_to_gsopt(tmp_path: Path, bands: int) -> None:
     assert_alike(ours, theirs, 1e-5)
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_any_codes_of_an_spz_mean_the_same_as_to_gsopt(tmp_path: Path, version: int) -> None:
+    pytest.importorskip("torch")
+    import gsopt
+    from gsopt.formats.ply import save_ply
+
+    count, bands = 500, 8
+    row = 9 + 1 + 3 + 3 + (3 if version == 2 else 4) + 3 * bands
+    codes = np.random.default_rng(version).integers(0, 256, count * row, np.uint8)
+    header = struct.pack("<4sIIBBBB", b"NGSP", version, count, 2, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + codes.tobytes()))
+    save_ply(tmp_path / "b.ply", gsopt.load_splats(tmp_path / "a.spz"))
+    ours, theirs = read_spz(tmp_path / "a.spz"), read_ply(tmp_path / "b.ply")
+    assert len(ours) > count // 2
+    ours.rotations[:] *= np.sign((ours.rotations * theirs.rotations).sum(axis=1, keepdims=True))
+    assert_alike(ours, theirs, 1e-5)
+
+
 @pytest.mark.parametrize(
     ("data", "said"),
     [

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from dataset_builders import nerf_synthetic
 from PIL import Image
 
+from gsopt.data import image_files
 from gsopt.data.image_files import write_image
 from gsopt.data.images import read_gray, read_header, read_pixels
 from gsopt.data.scene import load_scene
@@ -101,6 +104,24 @@ def test_a_bomb_is_refused_before_it_is_decoded(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Image.Image, "load", lambda self: pytest.fail("decoded"))
     with pytest.raises(InputError, match=r"a\.png.*11500x11500 pixels"):
         READERS[reader](path)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_an_image_at_a_limit_is_read_and_one_beyond_is_not(tmp_path: Path, channels: int) -> None:
+    file = tmp_path / "a.png"
+
+    def refused(pixels: int, size: int, **limits: int) -> str:
+        file.write_bytes(bytes(1))
+        os.truncate(file, size)
+        image = SimpleNamespace(width=pixels, height=1)
+        return image_files.bomb(image, file, channels, **limits)  # type: ignore[arg-type]
+
+    assert refused(100, 10, max_pixels=100) == ""
+    assert "101x1 pixels, more than the 100" in refused(101, 10, max_pixels=100)
+    for size in (1, image_files.MAX_PIXELS // image_files.MAX_EXPANSION + 120):
+        most = max(image_files.MAX_PIXELS, image_files.MAX_EXPANSION * size) // channels
+        assert refused(most, size, max_pixels=1 << 40) == ""
+        assert f"in a file of {size:,} bytes" in refused(most + 1, size, max_pixels=1 << 40)
 
 
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")

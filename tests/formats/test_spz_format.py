@@ -50,6 +50,15 @@ def test_known_bytes_read_as_known_values(tmp_path: Path) -> None:
     assert splats.sh_degree == 0
 
 
+@pytest.mark.parametrize("degree", range(4))
+def test_the_header_of_version_3_is_known_to_the_bit(tmp_path: Path, degree: int) -> None:
+    """Its last byte is reserved: other readers may refuse what they do not know."""
+    for antialiased in (False, True):
+        save_spz(tmp_path / "a.spz", make_splats(7, degree), antialiased=antialiased)
+        header = gzip.decompress((tmp_path / "a.spz").read_bytes())[: HEADER.size]
+        assert header == HEADER.pack(b"NGSP", 3, 7, degree, 16, int(antialiased), 0)
+
+
 @pytest.mark.parametrize(
     ("largest", "expected"),
     [(0, [0.3, 1, -0.1, -0.2]), (1, [0.3, 0.1, -1, -0.2]), (2, [0.3, 0.1, -0.2, -1]), (3, [1, 0.1, -0.2, -0.3])],

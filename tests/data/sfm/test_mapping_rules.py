@@ -10,9 +10,16 @@ from typing import Any
 import pytest
 from test_answers import CHAIN, NAMES, graph
 
-from gsopt.data.sfm import few_photos, mapping
+from gsopt.data.sfm import few_photos, known_poses, mapping, pipeline
 from gsopt.data.sfm.few_photos import Attempt, keep_confirmed, observations
-from gsopt.data.sfm.mapping import covisible_groups, keep_coherent, mappers_to_try, off_center, seed_photos
+from gsopt.data.sfm.mapping import (
+    MappingResult,
+    covisible_groups,
+    keep_coherent,
+    mappers_to_try,
+    off_center,
+    seed_photos,
+)
 from gsopt.data.sfm.settings import SfmConfig
 
 
@@ -350,3 +357,15 @@ def test_pairs_are_kept_with_enough_in_common_and_where_their_turn_agrees(
     assert only == {(1, 2): 18}
     assert database.geometries.keys() == found.keys()
     assert database.geometries[1, 2] != "before"
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_three_photos_are_enough_for_a_reconstruction(posed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = MappingResult(Reconstruction([1, 2, 3], []), "found", [])
+    monkeypatch.setattr(mapping, "find_poses", lambda *_: found)
+    monkeypatch.setattr(known_poses, "triangulate", lambda *_: found.reconstruction)
+    run = pipeline._Run(SimpleNamespace(), Path(), Path(), SfmConfig(), print)  # type: ignore[arg-type]
+    for photos in range(5):
+        view_graph = SimpleNamespace(features=dict.fromkeys(range(photos), 900))
+        mapped = run._mapped(SimpleNamespace(), view_graph, [] if posed else None)  # type: ignore[arg-type]
+        assert (mapped is not None) == (photos >= 3), photos
