@@ -213,7 +213,16 @@ def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows cannot be asked for a process without harm")
-def test_the_next_writer_removes_what_a_dead_one_left_and_leaves_the_living_alone(tmp_path: Path) -> None:
+def test_the_next_writer_removes_what_a_dead_one_left_and_leaves_the_living_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    signals, kill = set(), os.kill
+
+    def asked(process: int, signal: int) -> None:
+        signals.add(signal)
+        kill(process, 0)  # whatever was asked for: nothing must end
+
+    monkeypatch.setattr(os, "kill", asked)
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     left = f".metrics.json.{ended.pid}.tmp"
@@ -222,6 +231,7 @@ def test_the_next_writer_removes_what_a_dead_one_left_and_leaves_the_living_alon
     for name in (left, *others):
         (tmp_path / name).write_bytes(b"half")
     write_atomic(tmp_path / "metrics.json", b"{}")
+    assert signals == {0}, "a process is asked for, never signaled"
     assert sorted(os.listdir(tmp_path)) == sorted([*others, "metrics.json"])
     assert (tmp_path / "metrics.json").read_bytes() == b"{}"
 

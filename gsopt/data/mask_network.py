@@ -70,10 +70,11 @@ class MaskNetwork:
         name = self.session.get_inputs()[0].name
         try:
             found = np.asarray(self.session.run(None, {name: scaled.transpose(2, 0, 1)[None]})[0], dtype=np.float32)
-            found = found.reshape(found.shape[-2:])
+            height, width = found.shape[-2:]
+            found = found.reshape(height, width)
+            low, high = float(found.min()), float(found.max())
         except Exception as error:
             raise InputError(f"The mask model {self.path} gives no mask: {_first_line(error)}. {_REMEDY}") from error
-        low, high = float(found.min()), float(found.max())
         if not NOTHING < high < np.inf or not low > -np.inf:
             return np.zeros(pixels.shape[:2], np.float32)
         stretched = Image.fromarray((found - low) / max(high - low, 1e-6))

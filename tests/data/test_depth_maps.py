@@ -12,7 +12,7 @@ from PIL import Image
 
 from gsopt import cli
 from gsopt.config.train import DataConfig
-from gsopt.data.depth_maps import MAX_SIDE, DepthFolder, read_map
+from gsopt.data.depth_maps import MAX_FILE_SIDE, MAX_SIDE, DepthFolder, read_map
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
 
@@ -119,6 +119,17 @@ def test_a_file_that_is_no_depth_map_is_refused_in_one_line(tmp_path: Path, name
         read(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_map_at_the_limit_of_its_side_is_read_and_one_beyond_is_not(tmp_path: Path, axis: int) -> None:
+    for side, read in ((MAX_FILE_SIDE, True), (MAX_FILE_SIDE + 1, False)):
+        np.save(tmp_path / "a.npy", np.ones((side, 1) if axis == 0 else (1, side), np.uint8))
+        if read:
+            assert read_map(tmp_path / "a.npy").numel() == side
+        else:
+            with pytest.raises(InputError, match=r"a\.npy"):
+                read_map(tmp_path / "a.npy")
 
 
 def test_a_folder_that_fits_no_image_is_refused_before_any_work(

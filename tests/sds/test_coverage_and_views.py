@@ -6,9 +6,12 @@ import itertools
 import math
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from tiny_scenes import cloud
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.background import Background
@@ -79,6 +82,24 @@ def test_a_large_disc_a_little_behind_the_surface_is_seen_and_a_small_one_is_not
         disc = replace(disc, **{name: tensor[middle] for name, tensor in disc.items()})
         seen = coverage.coverage(wall(0.5).append(disc), [camera(0)], BACKEND)[-1]
         assert float(seen) == covered
+
+
+@pytest.mark.parametrize("shape", [(5, 9), (9, 5), (1, 3)])
+def test_the_surface_of_its_own_pixel_hides_a_ball(shape: tuple[int, int]) -> None:
+    """At every pixel, those of the border too: depths that differ wildly from pixel to pixel."""
+    height, width = shape
+    surface = 1 + 9 * torch.rand(height, width, generator=torch.Generator().manual_seed(1))
+    alphas = 0.6 + 0.4 * torch.rand(height, width, generator=torch.Generator().manual_seed(2))
+    frame = SimpleNamespace(depths=surface * alphas, alphas=alphas)
+    backend: Any = SimpleNamespace(forward=lambda *_, **__: frame)
+    eye = camera(30.0, 10.0, width=width, height=height)
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rays = torch.stack([columns + 0.5, rows + 0.5, torch.ones(shape)], -1).double() @ eye.Ks[0].double().inverse().T
+    for share in (0.9, 1.1):
+        points = (share * surface.double()[..., None] * rays).reshape(-1, 3) - eye.viewmats[0, :3, 3].double()
+        means = (points @ eye.viewmats[0, :3, :3].double()).float()
+        balls = replace(cloud(len(means), 0), means=means, log_scales=torch.full((len(means), 3), -9.0))
+        assert coverage.seen(balls, eye, backend).tolist() == pytest.approx([float(share < 1)] * len(means), abs=1e-4)
 
 
 def test_every_view_that_sees_it_adds_up_and_uncertainty_falls() -> None:

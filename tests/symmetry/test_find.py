@@ -107,6 +107,16 @@ def test_the_border_of_a_picture_is_no_outline(tmp_path: Path) -> None:
     assert float((column - 48).square().add((row - 48).square()).sqrt().std()) < 0.3
 
 
+def test_points_of_an_outline_lie_on_it(tmp_path: Path) -> None:
+    """To a fraction of a pixel, whichever way the outline runs."""
+    scene = scene_of(tmp_path / "thing", LOPSIDED)
+    for photo in small_photos(scene.train, 1):
+        outline = Outline.of(photo)
+        missed = outline.here(*outline_pixels(outline)).abs()
+        assert len(missed) > 50
+        assert float(missed.quantile(0.9)) < 0.1
+
+
 def test_candidates_that_end_in_one_mirror_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     n, across = slanted().normal, torch.nn.functional.normalize(torch.tensor([-0.35, 0.9, 0.0]), dim=0)
     tilted = [

@@ -20,7 +20,8 @@ from gsopt.raster.api import make_backend
 from gsopt.training.cells import divide as divide_module
 from gsopt.training.cells.divide import divide, ground_axes, relevant, split
 from gsopt.training.cells.plan import Cell, CellPlan, read_plan, sha256
-from gsopt.training.cells.size import cell_sizes
+from gsopt.training.cells.size import cell_sizes, sizes_of
+from gsopt.training.estimate import PIXEL_BYTES
 from gsopt.training.plan import RunPlan
 
 
@@ -182,3 +183,15 @@ def test_a_view_with_exactly_the_relevant_share_belongs_to_a_cell() -> None:
     assert relevant(shares).all()
     most = torch.cat([torch.full((divide_module.FEWEST_VIEWS,), 0.5), torch.full((9,), 0.01)])
     assert relevant(most).sum() == divide_module.FEWEST_VIEWS
+
+
+def test_memory_is_estimated_for_the_largest_view(data: Path) -> None:
+    config = big(data)
+    scene = load_scene(str(data))
+    plan = RunPlan.of(config, scene)
+    large, *others = scene.train
+    smaller = replace(scene, train=tuple(replace(view, camera=view.camera.resized(8, 8)) for view in others))
+    mixed = replace(smaller, train=(*smaller.train, large))
+    for part in ("coarse", "cell", "polish", "whole"):
+        few, many = (getattr(sizes_of(2, config, plan, one, None, 0), part).memory for one in (smaller, mixed))
+        assert many - few == PIXEL_BYTES * (large.camera.width * large.camera.height - 64)

@@ -184,3 +184,13 @@ def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
 def test_the_more_photos_the_fewer_mirror_images(views: int, images: int, drawn: int) -> None:
     scene = SimpleNamespace(train=(None,) * views, mirrored=(None,) * images, completed=False)
     assert plan.extra_per_epoch(scene) == drawn  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("iterations", [80, 1000, 4004])
+def test_the_last_eighth_is_averaged_where_nothing_is_added_in_it(iterations: int) -> None:
+    run = replace(
+        made(TrainConfig(iterations=iterations)), refine_stop=iterations // 2, coarse_until=(iterations // 4,)
+    )
+    assert run.averages_after == iterations - round(iterations / 8)
+    assert replace(run, refine_stop=iterations - 1).averages_after == iterations - 1
+    assert replace(run, coarse_until=(5, iterations - 2)).averages_after == iterations - 2

@@ -256,6 +256,10 @@ def test_a_glb_holds_the_mesh_in_the_axes_of_splats_and_linear_color(tmp_path: P
     indices = np.frombuffer(body, "<u4", 12, places[primitive["indices"]])
     assert indices.tolist() == pyramid().faces.flatten().tolist()
     accessors = document.root["accessors"]
+    components, widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}, {5123: 2, 5125: 4, 5126: 4}  # glTF 2.0, 3.6.2.2
+    lengths = [one["count"] * components[one["type"]] * widths[one["componentType"]] for one in accessors]
+    assert lengths == [view["byteLength"] for view in document.root["bufferViews"]]
+    assert [one["componentType"] for one in accessors] == [5126, 5126, 5123, 5125]
     assert [accessor.get("normalized", False) for accessor in accessors] == [
         False,
         False,
