@@ -14,7 +14,8 @@ from gsopt.data.scene import Scene, load_scene
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.projection import project
-from gsopt.symmetry.axis import Axis
+from gsopt.init.thumbnails import Thumbnail
+from gsopt.symmetry.axis import Axis, _middle_ray
 from gsopt.symmetry.find import find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.symmetry import Symmetry
@@ -33,6 +34,18 @@ def scene_of(folder: Path, balls: list[Ball], views: int, turn: float = 0.3) -> 
 
 def axis() -> Axis:
     return Axis(UP, torch.tensor([0.1, -0.05, 0.0]), 8)
+
+
+@pytest.mark.parametrize("pixel", [(0, 0), (3, 7), (11, 2), None])
+def test_the_middle_of_a_silhouette_is_that_of_its_pixels(pixel: tuple[int, int] | None) -> None:
+    """Pixel (row, column) has its center half a pixel farther; None: the whole photo, whose middle the axis passes."""
+    photo = ring(5)[2].resized(8, 12)
+    rgba = torch.zeros(4, 12, 8, dtype=torch.uint8)
+    rgba[(3, *pixel) if pixel else (3,)] = 255
+    ray = _middle_ray(Thumbnail(photo, rgba))
+    column, row, _ = project(photo, (photo.centers[0] + 3.7 * ray)[None])
+    expected = (4.0, 6.0) if pixel is None else (pixel[1] + 0.5, pixel[0] + 0.5)
+    assert (float(column), float(row)) == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("views", [1, 2, 3])
