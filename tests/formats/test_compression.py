@@ -1,13 +1,14 @@
-"""What a packed stream may cost, by its size."""
+"""What a packed stream may cost, by its size, and how large a .glb may be."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import pytest
 
 from gsopt.errors import InputError
-from gsopt.formats import compression
+from gsopt.formats import compression, gltf
 
 
 @pytest.mark.parametrize("packed", [10**6, 10**7, 10**9])
@@ -29,3 +30,10 @@ def test_the_budget_grows_with_the_file_and_has_a_floor(packed: int) -> None:
     compression.check_budget(limit, packed, Path("a.spz"))
     with pytest.raises(InputError, match="hostile"):
         compression.check_budget(limit + 1, packed, Path("a.spz"))
+
+
+def test_the_largest_glb_is_the_largest_that_its_header_can_name() -> None:
+    largest = gltf._MAX_SIZE
+    assert gltf.HEADER.unpack(gltf.HEADER.pack(gltf.MAGIC, 2, largest))[2] == largest
+    with pytest.raises(struct.error):
+        gltf.HEADER.pack(gltf.MAGIC, 2, largest + 1)

@@ -314,10 +314,6 @@ def test_meshes_are_no_splats(shared_data: Path) -> None:
 def test_a_file_beyond_the_limit_is_refused_before_it_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    largest = gltf._MAX_SIZE
-    assert gltf.HEADER.unpack(gltf.HEADER.pack(gltf.MAGIC, 2, largest))[2] == largest
-    with pytest.raises(struct.error):
-        gltf.HEADER.pack(gltf.MAGIC, 2, largest + 1)
     save_splats(tmp_path / "a.glb", make_splats(9))
     size = (tmp_path / "a.glb").stat().st_size
     monkeypatch.setattr(gltf, "_MAX_SIZE", size - 1)  # 4 GiB less 1 in earnest

@@ -1,0 +1,88 @@
+"""Stages of a search for poses: how many photos are enough, how a second look is taken, which points stay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_answers import CHAIN, graph
+
+from gsopt.data.sfm import few_photos, known_poses, mapping, pipeline
+from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm.mapping import MappingResult
+from gsopt.data.sfm.settings import SfmConfig
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_three_photos_are_enough_for_a_reconstruction(posed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = MappingResult(SimpleNamespace(), "found", [])
+    monkeypatch.setattr(mapping, "find_poses", lambda *_: found)
+    monkeypatch.setattr(known_poses, "triangulate", lambda *_: found.reconstruction)
+    run = pipeline._Run(SimpleNamespace(), Path(), Path(), SfmConfig(), print)  # type: ignore[arg-type]
+    for photos in range(5):
+        view_graph = SimpleNamespace(features=dict.fromkeys(range(photos), 900))
+        mapped = run._mapped(SimpleNamespace(), view_graph, [] if posed else None)  # type: ignore[arg-type]
+        assert (mapped is not None) == (photos >= 3), photos
+
+
+def rays(pycolmap: Any, angles: list[float], off: dict[int, float]) -> Any:
+    """Three cameras in a row; for each angle a point, which the outer ones see so many degrees apart. `off`: px by
+    which the first camera misses a point."""
+    found = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=1000, height=1000, params=[1000.0, 500.0, 500.0, 0.0], camera_id=1
+    )
+    found.add_camera_with_trivial_rig(camera)
+    depth = 0.5 / np.tan(np.radians(angles) / 2)
+    points = np.stack([np.zeros(len(depth)), np.random.default_rng(0).uniform(-0.4, 0.4, len(depth)) * depth, depth], 1)
+    for number, x in enumerate((-0.5, 0.0, 0.5), 1):
+        center = np.array([x, 0.0, 0.0])
+        pixels = 1000 * (points - center)[:, :2] / points[:, 2:] + 500
+        if number == 1:
+            pixels[list(off), 0] += list(off.values())
+        image = pycolmap.Image(name=f"{number}.png", keypoints=pixels, camera_id=1, image_id=number)
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -center))
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for number in (1, 2, 3):
+            track.add_element(number, row)
+        found.add_point3D(point, track)
+    return found
+
+
+@pytest.mark.parametrize("off", [0.0, 1.0, 60.0])
+def test_points_seen_from_one_side_or_far_from_their_pixels_are_left_out(off: float) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    sound = [5.0, 6, 7, 8, 9, 10, 12, 14, 16, 20] * 4
+    flat = [1.0, 1.4] if off == 0 else []  # too close to one side
+    angles = [*sound, 1.6, 2.4, 10.0, *flat]
+    project: Any = SimpleNamespace(pycolmap=pycolmap, config=SimpleNamespace(focal=1000.0))
+    model = rays(pycolmap, angles, off={len(sound) + 2: off})
+    kept = mapping.bundle_adjusted(project, model)
+    tracks = [kept.points3D[i + 1].track.length() if i + 1 in kept.points3D else 0 for i in range(len(angles))]
+    assert tracks[: len(sound)] == [3] * len(sound)
+    assert max(tracks[len(sound) + 3 :], default=0) == 0
+    if off == 0:
+        assert tracks[len(sound) :][:3] == [3, 3, 3]
+    else:
+        assert tracks[len(sound) + 2] == (3 if off < 4 else 2)
+    assert all(point.error <= 4 for point in kept.points3D.values())
+
+
+def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    looks: list[bool] = []
+    monkeypatch.setattr(
+        pipeline.features, "extract", lambda project, photos, masks, thorough=False: looks.append(thorough)
+    )
+    nothing = SimpleNamespace(matches=[], turntable=False)
+    monkeypatch.setattr(few_photos, "trust", lambda *_: 0)
+    monkeypatch.setattr(few_photos, "match_few", lambda *_: nothing)
+    monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, "another graph"))
+    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
+    project: Any = ColmapProject(SimpleNamespace(), tmp_path / "database.db", tmp_path, SfmConfig())  # type: ignore[arg-type]
+    inputs: Any = SimpleNamespace(kind="none", masks=None)
+    assert run._few(project, [], inputs, graph(CHAIN), None) == ("another graph", None)
+    assert looks == [True]
