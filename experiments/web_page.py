@@ -100,8 +100,9 @@ def viewer_screenshot(run: Path, browser: Tab) -> np.ndarray:
         while (browser.screenshot()[:, :800] < 240).any(axis=2).mean() < LOADED:
             time.sleep(1)
         time.sleep(SETTLED)
-        image = browser.screenshot()
-        return image
+        browser.value("document.querySelectorAll('.mantine-Notification-closeButton').forEach(one => one.click())")
+        time.sleep(1)
+        return browser.screenshot()
     finally:
         shown.stop()
 
