@@ -1,7 +1,8 @@
 """3 Run, when it is done: a closed mesh of the run, which stands for the splats where those can do nothing.
 
-Splats neither collide nor catch shadows. The proxy does both, lies where the splats lie, and shows nothing of itself:
-a wire in the viewport, a shadow catcher in Cycles. With the catcher turned off it is an ordinary mesh to be edited.
+Splats have no surface that collides, blocks light or is mirrored. The proxy has, lies where the splats lie, and shows
+nothing of itself: a wire in the viewport, hidden from the camera in renders. A shadow catcher would hide the splats
+behind it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ COLORS = "Col"
 
 
 class GSOPT_OT_mesh_proxy(WaitingOperator, bpy.types.Operator):
-    """Make a closed mesh of the run, which collides and catches shadows in place of the splats"""
+    """Make a closed mesh of the run, which collides and casts shadows in place of the splats"""
 
     bl_idname = "gsopt.mesh_proxy"
     bl_label = "Mesh Proxy"
@@ -55,7 +56,7 @@ def add_proxy(scene: Any, path: Path) -> Any:
     thing[PROXY] = str(run)
     thing[METERS] = meters_per_unit(run)
     thing.matrix_world = frame(scene.gsopt, data_of(run), thing[METERS])
-    thing.display_type, thing.is_shadow_catcher = "WIRE", True
+    thing.display_type, thing.visible_camera = "WIRE", False
     thing.modifiers.new("Collision", "COLLISION")
     thing.data.materials.append(colored_material())
     return thing

@@ -53,7 +53,9 @@ def test_a_mesh_proxy_stands_for_the_splats_or_the_reason_is_told(panel: Any, tm
     proxies = [thing for thing in bpy.context.scene.objects if thing.get("gsopt_proxy")]
     assert len(proxies) == 1
     proxy = proxies[0]
-    assert proxy.is_shadow_catcher
+    assert not proxy.visible_camera
+    assert proxy.visible_shadow
+    assert not proxy.is_shadow_catcher
     assert proxy.display_type == "WIRE"
     assert [modifier.type for modifier in proxy.modifiers] == ["COLLISION"]
     assert [polygon.loop_total for polygon in proxy.data.polygons] == [3] * 4
