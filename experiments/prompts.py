@@ -45,7 +45,7 @@ def write_arm(scene: Path, arm: str, note: dict[str, str], options: argparse.Nam
     if path.exists():
         return path
     made = path.with_name(f"{path.stem}-all.json")
-    flags = ["--notes", note["notes"], "--domain", note.get("domain", "generic"), "-o", str(made), "--overwrite"]
+    flags = ["--notes", note["notes"], "--domain", note.get("domain", "generic"), "-o", str(made), "--force"]
     flags += ["--category", note["category"]] if "category" in note else []
     if arm == "llm":
         flags += ["--llm", options.llm, "--model", options.model, "--timeout", str(options.timeout)]

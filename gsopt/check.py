@@ -9,6 +9,7 @@ import re
 import types
 import typing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from gsopt.errors import InputError, SettingError, UsageError, shortened
@@ -141,3 +142,11 @@ def shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
     if len(got) != len(expected) or any(e is not None and e != g for e, g in zip(expected, got, strict=True)):
         want = "[" + ", ".join("?" if e is None else str(e) for e in expected) + "]"
         raise InputError(f"`{name}` must have shape {want}, got {list(got)}. Reshape it before the call.")
+
+
+def writable(out: Path, force: bool) -> None:
+    """UsageError before any work when what exists would be lost, InputError when there is no folder to write to."""
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists already. Add --force to replace it, or name another with -o.")
+    if not out.absolute().parent.is_dir():
+        raise InputError(f"The folder of {out} does not exist. Make it first, or name another file with -o.")

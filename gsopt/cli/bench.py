@@ -81,7 +81,7 @@ class Suite:
 
     suite: Annotated[str, arg(metavar="sparse|paper|smoke|FILE.toml")]
     """A built-in suite, or a file that declares one of your own scenes as gsopt/benchmark/suites/smoke.toml does."""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="FILE.json")]
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE.json")]
     """Result file, written after every run; at the end FILE.html is drawn beside it."""
     root: Annotated[Path | None, arg(metavar="DATA")] = None
     """Folder that holds the suite's scenes; smoke brings its own, FILE.toml has them beside it when not given."""
@@ -247,7 +247,7 @@ def suite(flags: Suite) -> int:
     from gsopt.benchmark.suite.runner import estimate_suite, run_suite, work_folder
     from gsopt.benchmark.suite.single_run import SuiteContext
 
-    output = flags.output.absolute()
+    output = flags.out.absolute()
     folder = Path(flags.prior or "").expanduser()  # a run starts in another folder; any other name is an id
     prior = str(folder.absolute()) if flags.prior and folder.is_dir() else flags.prior
     options = SuiteContext(root, work_folder(output), flags.threads, prior, flags.llm, flags.model)
@@ -271,7 +271,7 @@ def suite_command(flags: Suite) -> str:
     words += ["--seeds", str(flags.seeds), *(("--arms", *flags.arms) if flags.arms else ())]
     words += ["--groups", *flags.groups] if flags.groups else []
     words += ["--prior", Path(flags.prior).name] if flags.prior else []
-    return shlex.join([*words, "-o", flags.output.name])
+    return shlex.join([*words, "-o", flags.out.name])
 
 
 def draw(flags: Draw) -> int:

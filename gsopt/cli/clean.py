@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from gsopt import check
 from gsopt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ def main(argv: Sequence[str]) -> int:
     """Clean, print counts per rule and return 0."""
     flags = tyro.cli(Flags, prog="gsopt clean", args=list(argv))
     is_run = flags.source.is_dir()
-    if flags.out is not None and flags.out.exists() and not flags.force:
-        raise UsageError(f"`--out` must not exist yet, got {flags.out}. Add --force to replace it.")
+    if flags.out is not None:
+        check.writable(flags.out, flags.force)
     if flags.undo:
         from gsopt.results.clean_files import undo
 

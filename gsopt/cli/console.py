@@ -11,8 +11,6 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from gsopt.errors import UsageError
-
 PLAIN_SHARE = 0.1
 """A plain line is written whenever this share of the steps has passed."""
 
@@ -20,14 +18,6 @@ PLAIN_SHARE = 0.1
 def report(line: str) -> None:
     """Print one line at once, also when stdout is a pipe."""
     print(line, flush=True)
-
-
-def require_writable(output: Path, overwrite: bool) -> None:
-    """UsageError before any work when the file could not be written, or would be lost."""
-    if output.exists() and not overwrite:
-        raise UsageError(f"{output} exists already. Add --overwrite to replace it, or name another file with -o.")
-    if not output.absolute().parent.is_dir():
-        raise UsageError(f"The folder of {output} does not exist. Make it first, or name another file with -o.")
 
 
 class RunConsole:

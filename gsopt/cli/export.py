@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from gsopt import check
 from gsopt.errors import InputError, UsageError
 from gsopt.formats import READABLE, SUFFIXES, is_antialiased, load_splats, save_splats, suffix_of
 
@@ -51,10 +52,7 @@ def main(argv: Sequence[str]) -> int:
     suffix, share = suffix_of(out, (*SUFFIXES, PAGE)), share_of(flags.decimate)
     if suffix == PAGE and share < 1:
         raise UsageError("`--decimate` is for splat files. Export one, then make the page of that file.")
-    if out.exists() and not flags.force:
-        raise UsageError(f"`--out` must not exist yet, got {out}. Add --force to replace it, or choose another name.")
-    if not out.parent.is_dir():
-        raise InputError(f"`--out` must lie in a folder that exists, got {out.parent}. Create it first.")
+    check.writable(out, flags.force)
     from gsopt.results.measure import units_of
 
     source = splats_in(flags.source)

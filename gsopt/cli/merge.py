@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gsopt.errors import InputError, UsageError
+from gsopt import check
 from gsopt.formats import SUFFIXES, suffix_of
 
 if TYPE_CHECKING:
@@ -37,10 +37,7 @@ def main(argv: Sequence[str]) -> int:
     """Merge, print what was found and what it changes, and return 0."""
     flags = tyro.cli(Flags, prog="gsopt merge", args=list(argv))
     suffix_of(flags.out, SUFFIXES)
-    if flags.out.exists() and not flags.force:
-        raise UsageError(f"`--out` must not exist yet, got {flags.out}. Add --force to replace it.")
-    if not flags.out.parent.is_dir():
-        raise InputError(f"`--out` must lie in a folder that exists, got {flags.out.parent}. Create it first.")
+    check.writable(flags.out, flags.force)
 
     from gsopt.formats import save_splats
     from gsopt.results.finished_run import open_run

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from gsopt.errors import InputError, UsageError
+from gsopt import check
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,7 @@ def main(argv: Sequence[str]) -> int:
     from gsopt.results.mesh.extract import extract_mesh
 
     suffix_of(flags.out, SUFFIXES)
-    if flags.out.exists() and not flags.force:
-        raise UsageError(f"`--out` must not exist yet, got {flags.out}. Add --force to replace it.")
-    if not flags.out.parent.is_dir():
-        raise InputError(f"`--out` must lie in a folder that exists, got {flags.out.parent}. Create it first.")
+    check.writable(flags.out, flags.force)
     run = open_run(flags.run, threads=flags.threads)
     mesh = extract_mesh(run, faces=flags.faces, voxels=flags.voxels, box=flags.box)
     save_mesh(flags.out, mesh, units_of(flags.run))

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from gsopt import check
-from gsopt.errors import UsageError
 
 if TYPE_CHECKING:
     from gsopt.geometry.cameras import Cameras
@@ -28,7 +27,7 @@ class Flags:
     """train and test: those views; orbit and ellipse: around the subject; turntable: the orbit, or a swing where the
     cameras stood on one side only; interpolated: through the input views in their order; FILE.json: nerfstudio's
     camera path."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A folder for PNG frames, a film that ends in .mp4, .webp or .gif, or a .json: the camera path, nothing drawn.
     RUN/frames/PATH when not given."""
     frames: int = 120
@@ -37,7 +36,7 @@ class Flags:
     """Frames per second of a film."""
     size: int | None = None
     """Scale the frames so that the longer side has this many pixels."""
-    overwrite: bool = False
+    force: bool = False
     """Replace files that exist."""
     backend: Literal["auto", "cpu", "cuda", "mps", "reference"] | None = None
     """Draw with this backend instead of the run's."""
@@ -61,15 +60,15 @@ def main(argv: Sequence[str]) -> int:
 
     run = open_run(flags.run, flags.backend, flags.threads)
     shots = cameras_along(run, flags.path, flags.frames, flags.size)
-    if flags.output is None:
+    if flags.out is None:
         refuse_links(flags.run)
-    output = flags.output or flags.run / "frames" / Path(flags.path).stem
+    output = flags.out or flags.run / "frames" / Path(flags.path).stem
     if output.suffix.lower() == ".json":
         write_path(output, [camera for _, camera in shots], flags, origin=units_of(flags.run).origin)
     elif output.suffix.lower() in VIDEO_SUFFIXES:
-        render_video(run, shots, output, flags.fps, overwrite=flags.overwrite)
+        render_video(run, shots, output, flags.fps, overwrite=flags.force)
     else:
-        render_stills(run, shots, output, overwrite=flags.overwrite)
+        render_stills(run, shots, output, overwrite=flags.force)
     print(f"Written: {len(shots)} {'cameras' if output.suffix.lower() == '.json' else 'frames'} to {output}")
     return 0
 
@@ -78,6 +77,5 @@ def write_path(output: Path, cameras: list[Cameras], flags: Flags, origin: tuple
     """Write the cameras as nerfstudio's JSON; UsageError where a file is in the way."""
     from gsopt.results.camera_path_file import write_camera_path
 
-    if output.exists() and not flags.overwrite:
-        raise UsageError(f"`--output` must not exist yet, got {output}. Add --overwrite to replace it.")
+    check.writable(output, flags.force)
     write_camera_path(output, cameras, flags.fps, origin)

@@ -21,7 +21,7 @@ class Flags:
 
     scenes: Annotated[Positional[Path], arg(metavar="SCENES")]
     """Folder whose subfolders are scenes or photos, or FILE.json: {"scenes": [{"data": DIR, "flags": [...]}]}."""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="RUNS")]
+    out: Annotated[Path, arg(aliases=["-o"], metavar="RUNS")]
     """Folder of the runs."""
     farm: Annotated[str, arg(metavar="local[:CORES]|ray[://HOST:PORT]")] = "local"
     """Machines of the runs; every core of this one when not given."""
@@ -58,7 +58,7 @@ def main(argv: Sequence[str]) -> int:
     from gsopt.many_scenes.train_scenes import PAGE, Limits, train_scenes
 
     limits = Limits(flags.threads, memory, flags.time_limit)
-    records = train_scenes(scenes, flags.output, farm, limits, lambda line: print(line, flush=True))
+    records = train_scenes(scenes, flags.out, farm, limits, lambda line: print(line, flush=True))
     failed = [record["name"] for record in records if record["state"] != "done"]
-    print(f"{len(records) - len(failed)} of {len(records)} scenes: {flags.output / PAGE}")
+    print(f"{len(records) - len(failed)} of {len(records)} scenes: {flags.out / PAGE}")
     return InputError.exit_code if failed else 0

@@ -31,10 +31,10 @@ def save_video(output: Path, renders: Iterable[UInt8[Tensor, "H W 3"]], fps: flo
     MissingDependency for MP4 without the package `av`.
     """
     kind = output.suffix.lower()
-    check.one_of("suffix of --output", kind, VIDEO_SUFFIXES)
+    check.one_of("suffix of --out", kind, VIDEO_SUFFIXES)
     check.within("--fps", fps, 0.1, 240, "24 is usual.")
     if output.exists() and not overwrite:
-        raise UsageError(f"{output} exists already. Add --overwrite to replace it, or name another file.")
+        raise UsageError(f"{output} exists already. Add --force to replace it, or name another file.")
     if kind == ".mp4":
         require("av", "video", "Writing an MP4 video")
     images = _same_size(renders, MAX_SIDE[kind])
@@ -89,7 +89,7 @@ def save_stills(
     for name, render in renders:
         path = folder / f"{name}.png"
         if path.exists() and not overwrite:
-            raise UsageError(f"{path} exists already. Add --overwrite to replace it, or name another folder.")
+            raise UsageError(f"{path} exists already. Add --force to replace it, or name another folder.")
         with replacing(path) as file:
             as_image(render).save(file, format="PNG")
         written.append(path)

@@ -67,7 +67,7 @@ def test_without_a_model_nothing_heavy_is_loaded(tmp_path: Path) -> None:
 def test_same_words_same_file(tmp_path: Path) -> None:
     assert run(tmp_path) == 0
     first = (tmp_path / "prompts.json").read_bytes()
-    assert run(tmp_path, "--overwrite") == 0
+    assert run(tmp_path, "--force") == 0
     assert (tmp_path / "prompts.json").read_bytes() == first
     assert not (tmp_path / "prompts.raw.json").exists()
 
@@ -236,7 +236,7 @@ def test_pictures_from_prompts_are_drawn_shown_and_not_accepted(tmp_path: Path, 
     with Image.open(tmp_path / made.images[0].file) as image:
         assert image.size == (64, 64)
     assert drawn[0] != drawn[1]
-    assert run(tmp_path, *draw, "--overwrite") == 0  # same seed, same pictures; those of before are kept
+    assert run(tmp_path, *draw, "--force") == 0  # same seed, same pictures; those of before are kept
     again = read_set(tmp_path / "prompts.json").images
     assert [(tmp_path / picture.file).read_bytes() for picture in again] == drawn
     assert len(list((tmp_path / "prompts-images").glob("*.png"))) == 4

@@ -170,7 +170,7 @@ def test_structured_output_is_asked_for_with_the_schema_of_what_is_wanted(tmp_pa
 def test_for_a_library_the_model_is_asked_for_kind_material_parts_and_proportions(tmp_path: Path) -> None:
     with serving([VALID]) as server:
         assert run(tmp_path, server.url) == 0
-        assert run(tmp_path, server.url, "--prior", "library", "--overwrite") == 0
+        assert run(tmp_path, server.url, "--prior", "library", "--force") == 0
     plain, asked = (request["body"]["messages"][1]["content"] for request in server.asked)
     for wanted in ("kind of thing is a chair", "made of, in one word", "parts stand out", "typical proportions"):
         assert wanted in asked
@@ -193,7 +193,7 @@ def test_pictures_go_to_a_server_that_takes_them_and_are_left_out_where_not(tmp_
     assert parts[1]["image_url"]["url"].startswith("data:image/jpeg;base64,/9j/")
     picky = type(VALID)(VALID.body, only_without="image_url")
     with serving([picky]) as server:
-        assert run(tmp_path, server.url, "--images", str(photo), "--overwrite") == 0
+        assert run(tmp_path, server.url, "--images", str(photo), "--force") == 0
     assert isinstance(server.asked[0]["body"]["messages"][1]["content"], str)
     made = read_set(tmp_path / "prompts.json").made
     assert made is not None
@@ -211,7 +211,7 @@ def test_the_only_model_of_a_server_is_taken_and_a_choice_is_left_to_the_user(tm
     assert "llm:only/one" in (tmp_path / "prompts.json").read_text()
     listing.body = b'{"data": [{"id": "a"}, {"id": "b\\u001b[1m"}]}'
     with serving([listing]) as server:
-        assert cli.main([*arguments, server.url, "--overwrite"]) == 2
+        assert cli.main([*arguments, server.url, "--force"]) == 2
     assert "It lists: a, b[1m." in capsys.readouterr().err
 
 
@@ -296,4 +296,4 @@ def test_a_file_that_exists_is_not_overwritten(tmp_path: Path, capsys) -> None:
         assert run(tmp_path, server.url) == 2
     assert server.asked == []
     assert (tmp_path / "prompts.json").read_text() == "mine"
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--force" in capsys.readouterr().err

@@ -61,7 +61,7 @@ def test_a_run_is_rendered_along_a_file_that_it_wrote(tmp_path: Path, capsys: py
     assert len(pictures[0]) == 3
     capsys.readouterr()
     assert main(["render", str(run), "-o", str(path)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--force" in capsys.readouterr().err
     assert main(["render", str(run), "--path", "spiral"]) == 2
     assert "turntable" in capsys.readouterr().err
 

@@ -44,7 +44,7 @@ def test_a_film_path_has_the_frames_asked_for_and_the_subject_in_the_middle(run:
 
 def test_a_film_goes_where_it_is_told(run: Path, tmp_path: Path) -> None:
     output = tmp_path / "turn.webp"
-    assert cli_render.main([str(run), "--frames", "3", "--output", str(output), "--size", "16"]) == 0
+    assert cli_render.main([str(run), "--frames", "3", "--out", str(output), "--size", "16"]) == 0
     with Image.open(output) as film:
         assert (film.n_frames, film.size) == (3, (16, 13))
 
@@ -53,7 +53,7 @@ def test_frames_go_to_the_run_when_nothing_is_said_and_are_not_written_over(run:
     assert cli_render.main([str(run), "--path", "train"]) == 0
     first = run / "frames" / "train" / "0000_r_0.png"
     assert Image.open(first).size == (WIDTH, HEIGHT)
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="--force"):
         cli_render.main([str(run), "--path", "train"])
 
 

@@ -57,10 +57,10 @@ def test_stills_are_lossless_and_named(tmp_path: Path) -> None:
 def test_nothing_is_written_over_unless_asked(tmp_path: Path) -> None:
     film = tmp_path / "film.gif"
     film.write_bytes(b"precious")
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="--force"):
         save_video(film, pictures(1), fps=10)
     (tmp_path / "a.png").write_bytes(b"precious")
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="--force"):
         save_stills(tmp_path, [("a", pictures(1)[0])])
     assert film.read_bytes() == (tmp_path / "a.png").read_bytes() == b"precious"
     save_video(film, pictures(2), fps=10, overwrite=True)

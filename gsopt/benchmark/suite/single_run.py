@@ -135,7 +135,7 @@ def prompts(case: Case, context: SuiteContext) -> Path | None:
     command = ["prompts", "--notes", str(note["notes"]), "--domain", domain]
     command += ["--category", str(note["category"])] if "category" in note else []
     command += ["--llm", context.llm, "--model", context.model] if case.arm == "ours-llm" else []
-    call([*command, "-o", str(every), "--overwrite"])
+    call([*command, "-o", str(every), "--force"])
     found = read_set(every).prompts
     write_prompts(path, [prompt for prompt in found if prompt.source.startswith(arm_flags.PROMPT_SOURCES[case.arm])])
     return path

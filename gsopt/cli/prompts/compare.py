@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from tyro.conf import Positional, arg
 
-from gsopt.cli.console import report, require_writable
+from gsopt import check
+from gsopt.cli.console import report
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.errors import UsageError
@@ -49,16 +50,16 @@ class Flags:
     """Same seed, same data, same bits."""
     threads: int = 0
     """0 = one per core."""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="FILE.html")] = Path("comparison.html")
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE.html")] = Path("comparison.html")
     """The page; the figures go to FILE.json beside it."""
-    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace the page if it exists."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Compare and write the page; the exit code."""
     flags = tyro.cli(Flags, prog="gsopt prompts compare", args=list(argv))
-    require_writable(flags.output, flags.overwrite)
+    check.writable(flags.out, flags.force)
     config = read_config(flags)
     arms = read_arms(flags)
 
@@ -80,7 +81,7 @@ def main(argv: Sequence[str]) -> int:
         scene = load_scene(config.data)
         compared = compare_prompts(config, scene, make_backend("auto", flags.threads), prior, arms, report)
     write_page(flags, compared, prior.name)
-    report(f"{flags.output}: open it in a browser")
+    report(f"{flags.out}: open it in a browser")
     return 0
 
 
@@ -150,8 +151,8 @@ def write_page(flags: Flags, compared: Comparison, prior: str) -> None:
         "views": list(compared.views),
         "arms": [{"name": c.name, "mean": c.mean, "psnr": list(c.psnrs), "alignment": c.alignment} for c in columns],
     }
-    write_atomic(flags.output, encoded(comparison_page(title, facts, compared.views, truths, columns)))
-    write_atomic(flags.output.with_suffix(".json"), to_json(document))
+    write_atomic(flags.out, encoded(comparison_page(title, facts, compared.views, truths, columns)))
+    write_atomic(flags.out.with_suffix(".json"), to_json(document))
 
 
 def to_image(picture: Any) -> Any:

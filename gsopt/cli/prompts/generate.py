@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import arg
 
-from gsopt.cli.console import report, require_writable
+from gsopt import check
+from gsopt.cli.console import report
 from gsopt.cli.prompts.review import review_file
 from gsopt.errors import UsageError
 
@@ -63,9 +64,9 @@ class Flags:
     """Make reference images with the prior's text-to-image pipeline; they guide only after a review accepted them."""
     image_steps: int = 25
     """Denoising steps of such an image."""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="FILE")] = Path("prompts.json")
+    out: Annotated[Path, arg(aliases=["-o"], metavar="FILE")] = Path("prompts.json")
     """File to write; a model's answers go to FILE.raw.json beside it."""
-    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace the file if it exists."""
 
 
@@ -82,11 +83,11 @@ def write(flags: Flags) -> int:
 
     prices = read_prices(flags.price)
     settings = ImageSettings(flags.images_from_prompts, flags.seed, flags.image_steps)
-    require_writable(flags.output, flags.overwrite)
+    check.writable(flags.out, flags.force)
     job = read_job(flags)
     result = make_prompts(job, report)
     made = result.made
-    raw = raw_file(flags.output)
+    raw = raw_file(flags.out)
     if result.record is not None:
         write_record(raw, result.record)
         made = replace(made, made=replace(made.made, raw=raw.name)) if made.made else made
@@ -94,11 +95,11 @@ def write(flags: Flags) -> int:
     require_model_prompts(result, job, raw)
     made = with_pictures(made, flags, settings)
     show(made)
-    write_set(flags.output, made)
-    report(f"{flags.output}: {len(made.prompts)} prompts, tokens by {result.counter.name}")
+    write_set(flags.out, made)
+    report(f"{flags.out}: {len(made.prompts)} prompts, tokens by {result.counter.name}")
     if flags.review:
-        return review_file(flags.output, made)
-    report(f"not reviewed; go through them with: gsopt prompts review {flags.output}")
+        return review_file(flags.out, made)
+    report(f"not reviewed; go through them with: gsopt prompts review {flags.out}")
     return 0
 
 
@@ -130,7 +131,7 @@ def with_pictures(made: PromptSet, flags: Flags, settings: ImageSettings) -> Pro
         return made
     from gsopt.llm_prompts.reference_images import PAGE, generate_images
 
-    folder = flags.output.with_name(f"{flags.output.stem}-images")
+    folder = flags.out.with_name(f"{flags.out.stem}-images")
     pictures, reason = generate_images(flags.prior, made.prompts, settings, folder, report)
     if reason is not None:
         report(f"no pictures: {reason}")

@@ -288,7 +288,7 @@ def test_the_command_writes_a_mesh_and_refuses_to_replace_one(
     ("arguments", "code", "message"),
     [
         (["-o", "object.stl"], 3, "must end in one of"),
-        (["-o", "absent/object.ply"], 3, "folder that exists"),
+        (["-o", "absent/object.ply"], 3, "does not exist"),
         (["-o", "object.ply", "--box", "1", "1", "1", "0", "0", "0"], 3, "x < X"),
         (["-o", "object.ply", "--box", "50", "50", "50", "51", "51", "51", "--voxels", "16"], 3, "no surface"),
         (["-o", "object.ply", "--voxels", "2"], 2, "--voxels"),
