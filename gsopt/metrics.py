@@ -80,21 +80,23 @@ def color_corrected(
     per image, `cc_psnr` (Mildenhall et al. 2022, RawNeRF; Wang et al. 2024, bilateral guided radiance fields). As
     there, least squares over pixels that are clipped in neither image, again after each correction. `alphas` weigh
     the pixels, and what they leave transparent keeps its color."""
-    truths, corrected = truth.double().view(-1, 3), rendered.double().view(-1, 3)
-    sources = torch.cat([corrected, torch.ones_like(corrected[:, :1])], dim=1)
-    identity = torch.eye(4, 3, dtype=torch.float64, device=sources.device)
-    weights = torch.ones_like(corrected[:, 0]) if alphas is None else alphas.double().flatten()
-    shown = (_unclipped(truths) & _unclipped(sources[:, :3])) * weights
-    ridge = CC_RIDGE * len(sources) * torch.eye(4, dtype=torch.float64, device=sources.device)
+    weights = torch.ones_like(truth[..., 0]) if alphas is None else alphas
+    colors, truths = (image.double().view(-1, 3).T.contiguous() for image in (rendered, truth))
+    sources = torch.cat([colors, torch.ones_like(colors[:1])])
+    counted = (_unclipped(colors) & _unclipped(truths) & (weights.flatten() > 0)).nonzero()[:, 0]
+    fitted, targets, shares = sources[:, counted], truths[:, counted], weights.flatten()[counted].double()
+    ridge = CC_RIDGE * weights.numel() * torch.eye(4, dtype=torch.float64, device=truth.device)
+    corrected = fitted[:3]
     for _ in range(CC_ROUNDS):
-        weighted = (shown * _unclipped(corrected))[:, None] * sources
-        warp = torch.linalg.solve(weighted.T @ sources + ridge, weighted.T @ truths + ridge @ identity)
-        corrected = (sources @ warp).clamp(0, 1)
-    return (rendered + weights.view(*truth.shape[:2], 1) * (corrected.view(truth.shape) - rendered)).to(truth)
+        weighted = fitted * (shares * _unclipped(corrected))
+        warp = torch.linalg.solve(weighted @ fitted.T + ridge, weighted @ targets.T + ridge[:, :3]).T
+        corrected = (warp @ fitted).clamp_(0, 1)
+    everywhere = (warp @ sources).clamp_(0, 1).T.view(truth.shape)
+    return (rendered + weights.double()[..., None] * (everywhere - rendered)).to(truth)
 
 
-def _unclipped(colors: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
-    return ((colors >= CC_CLIPPED) & (colors <= 1 - CC_CLIPPED)).all(dim=1)
+def _unclipped(colors: Float[Tensor, "3 N"]) -> Bool[Tensor, "N"]:
+    return ((colors >= CC_CLIPPED) & (colors <= 1 - CC_CLIPPED)).all(dim=0)
 
 
 def ssim(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:

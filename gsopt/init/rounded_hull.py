@@ -75,5 +75,16 @@ def thickness(cells: Bool[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"]:
     thick = torch.zeros(solid.shape)
     for level in reversed(range(1 + int(math.log(max(1.0, largest), RADIUS_RATIO)))):
         radius = largest / RADIUS_RATIO**level
-        thick[squared_distance(depth >= radius**2, math.ceil(radius)) <= radius**2] = radius
+        centers = depth >= radius**2
+        within = _box(centers, math.ceil(radius))
+        covered = squared_distance(centers[within], math.ceil(radius)) <= radius**2
+        thick[within].masked_fill_(covered, radius)
     return (thick * solid)[1:-1, 1:-1, 1:-1]
+
+
+def _box(cells: Bool[Tensor, "X Y Z"], margin: int) -> tuple[slice, ...]:
+    """The box of the true cells and a margin around it, within the grid."""
+    planes = cells.any(2)
+    occupied = planes.any(1), planes.any(0), cells.any(0).any(0)
+    spans = [torch.nonzero(along)[:, 0] for along in occupied]
+    return tuple(slice(max(0, int(span[0]) - margin), int(span[-1]) + margin + 1) for span in spans)

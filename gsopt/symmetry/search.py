@@ -128,10 +128,10 @@ def _also_behind(
     """True when the mirror image of a voxel's center lies in `wide`, which is padded by one voxel."""
     beyond = sum(centers[:, axis, None] * normals[:, axis] for axis in range(3)) - offsets
     inside_grid = torch.ones_like(beyond, dtype=torch.bool)
-    index = torch.zeros_like(beyond, dtype=torch.int64)
+    index = torch.zeros_like(beyond, dtype=torch.int32)
     for axis, size in enumerate(wide.shape):
         there = (centers[:, axis, None] - 2 * beyond * normals[:, axis] - grid.low[axis]) / grid.voxel
-        cell = there.floor().long() + 1
+        cell = there.floor().int() + 1
         inside_grid &= (cell >= 0) & (cell < size)
         index = index * size + cell.clamp(0, size - 1)
     return wide.flatten()[index] & inside_grid

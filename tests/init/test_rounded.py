@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,24 @@ def test_the_thickness_of_a_ball_a_slab_and_a_rod() -> None:
         assert radius / RADIUS_RATIO - 1 <= float(middle) <= radius + 1
     assert bool((thick[~(ball | slab | rod)] == 0).all())
     assert not bool(thickness(torch.zeros(4, 4, 4, dtype=torch.bool)).any())
+
+
+@pytest.mark.parametrize("squared", [1, 2, 3, 4, 5])
+def test_the_thickness_is_the_largest_ball_of_its_definition(squared: int) -> None:
+    """A ball with holes, whose squared radius is no square; each level written out over all pairs of cells."""
+    cells = torch.rand(11, 9, 10, generator=torch.Generator().manual_seed(squared)) < 0.93
+    offset = torch.cartesian_prod(*(torch.arange(size) for size in cells.shape)) - torch.tensor([5, 4, 5])
+    cells &= offset.square().sum(1).view(cells.shape) < squared
+    places = torch.nonzero(torch.nn.functional.pad(~cells, (1,) * 6, value=True)) - 1
+    inside = torch.nonzero(cells)
+    depth = torch.cdist(inside.double(), places.double()).square().round().amin(1)
+    between = torch.cdist(inside.double(), inside.double()).square().round()
+    largest, expected = math.sqrt(float(depth.max())), torch.zeros(len(inside))
+    for level in range(99, -1, -1):
+        radius = largest / RADIUS_RATIO**level
+        if radius >= 1:
+            expected[(between[:, depth > radius**2 - 1e-6] < radius**2 + 1e-6).any(1)] = radius
+    assert torch.equal(thickness(cells)[cells], expected)
 
 
 @pytest.mark.parametrize("views", [3, 4, 6])
