@@ -29,10 +29,11 @@ def main(argv: Sequence[str]) -> int:
     """Write the masks, print the report and return 0."""
     flags = tyro.cli(Flags, prog="gsopt masks", args=list(argv))
 
+    from gsopt.config.train import DataConfig
     from gsopt.data.mask_network import MaskNetwork, find_model
     from gsopt.init.cut_out import cut_out
 
     network = MaskNetwork.open(find_model(None if flags.model is None else str(flags.model)))
-    for line in cut_out(flags.photos, flags.out, network, report).lines():
+    for line in cut_out(DataConfig(path=str(flags.photos)), flags.out, network, report).lines():
         print(line)
     return 0

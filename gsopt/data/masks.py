@@ -33,8 +33,7 @@ def with_masks(dataset: Dataset, root: Path, choice: str = "given") -> Dataset:
     folder = root / FOLDER
     if not folder.is_dir():
         return dataset
-    masked = _masked(dataset, lambda frames: _own_first(frames, folder))
-    return replace(masked, warnings=[*dataset.warnings, *_unmasked_warning(masked, folder)])
+    return _masked(dataset, lambda frames: _own_first(frames, folder))
 
 
 def _with_folder(dataset: Dataset, folder: Path) -> Dataset:
@@ -47,7 +46,7 @@ def _with_folder(dataset: Dataset, folder: Path) -> Dataset:
             f"The folder {folder} has a mask for none of the {len(frames)} images ({summarize_names([frames[0].name])}"
             ", ...). Name each mask like its image, with .png at the end."
         )
-    return replace(masked, warnings=[*dataset.warnings, *_unmasked_warning(masked, folder)])
+    return masked
 
 
 def _own_first(frames: list[PosedImage], folder: Path) -> list[Path | None]:
@@ -65,10 +64,11 @@ def _masked(dataset: Dataset, choose: MaskChoice) -> Dataset:
     return replace(dataset, frames=masked[:count], held_out=None if dataset.held_out is None else masked[count:])
 
 
-def _unmasked_warning(dataset: Dataset, folder: Path) -> list[str]:
-    frames = [*dataset.frames, *(dataset.held_out or [])]
+def unmasked_warning(frames: list[PosedImage], root: Path, choice: str) -> list[str]:
+    """A warning that names the images without a mask, where there is a folder of masks."""
+    folder = root / FOLDER if choice == "given" else Path(choice).expanduser()
     unmasked = [frame.name for frame in frames if frame.mask is None]
-    if not unmasked:
+    if choice == "none" or not folder.is_dir() or not unmasked:
         return []
     return [f"{folder.name}/ has no mask for {len(unmasked)} of {len(frames)} images: {summarize_names(unmasked)}."]
 

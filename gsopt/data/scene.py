@@ -18,7 +18,7 @@ from gsopt.data.depth_maps import DepthFolder
 from gsopt.data.idr import CAMERAS, read_idr
 from gsopt.data.images import ImageSource, ImageStore, check_mask_size, read_header, size_mismatch
 from gsopt.data.llff import POSES, read_llff
-from gsopt.data.masks import with_masks
+from gsopt.data.masks import unmasked_warning, with_masks
 from gsopt.data.posed_images import Dataset, PosedImage, summarize_names
 from gsopt.data.resample import downscaled_size
 from gsopt.data.split import split
@@ -156,7 +156,7 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     train, test = split(dataset, config)
     if not train:
         raise InputError(f"{root} has no input view left after the test views were held out. Add images.")
-    warnings = list(dataset.warnings)
+    warnings = [*dataset.warnings, *unmasked_warning(train + test, root, config.masks)]
     origin = _origin(dataset.frames + (dataset.held_out or []), warnings)  # the same whichever views are chosen
     depths = _depth_files(train, config, warnings)  # held-out views need none
     views, has_alpha = _views(root, train + test, depths, origin, config)

@@ -23,10 +23,12 @@ from gsopt.data import files
 from gsopt.data.images import read_gray, read_header, read_pixels
 from gsopt.data.mask_network import MaskNetwork, find_model
 from gsopt.data.masks import FOLDER
+from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import Scene, is_posed, load_scene, read_dataset
 from gsopt.data.sfm.photos import find_photos, read_photos
 from gsopt.data.sfm.reuse import needs_poses
 from gsopt.data.sfm.video import is_video
+from gsopt.data.split import split
 from gsopt.data.working_folder import working_folder
 from gsopt.errors import InputError, UsageError
 from gsopt.events import Report, to_json, write_atomic
@@ -79,42 +81,48 @@ class MaskFolder:
         return lines + [f"  {name} disagrees with the others; training repairs it." for name in self.disagreeing]
 
 
-def cut_out(source: Path, out: Path | None, network: MaskNetwork, report: Report = lambda line: None) -> MaskFolder:
-    """Write a soft mask for every photo of `source` (posed or not) to `out`, by default its folder masks/.
+def cut_out(data: DataConfig, out: Path | None, network: MaskNetwork, report: Report = lambda line: None) -> MaskFolder:
+    """Write a soft mask for every photo (posed or not) that `data` chooses to `out`, by default its folder masks/.
+    What held-out photos show changes no mask of an input view.
 
     Raises UsageError when `out` holds something, InputError for photos that cannot be read. `out` appears when it is
     complete.
     """
-    out = (source / FOLDER if out is None else out).expanduser().absolute()
+    out = (Path(data.path) / FOLDER if out is None else out).expanduser().absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"`--out` must not exist yet, got {out}. Choose another name, or remove it first.")
     with working_folder(out) as work:
-        photos = _photos(source, work)
+        photos = _photos(data, work)
         for number, photo in enumerate(photos, 1):
             _write(photo, network.probabilities(_colors(photo)))
             report(f"mask {number} of {len(photos)}: {photo.name}")
-        disagreeing = _look_closer(source, photos, network, work, report)
-        made = _finished(photos, disagreeing, out, network, source, work)
+        disagreeing = _look_closer(data, photos, network, work, report)
+        made = _finished(photos, disagreeing, out, network, data, work)
         if out.is_dir():
             out.rmdir()
         os.replace(work / FOLDER, out)
     return made
 
 
-def _photos(source: Path, work: Path) -> list[MaskedPhoto]:
+def _photos(data: DataConfig, work: Path) -> list[MaskedPhoto]:
     """The images of a dataset as they are stored, or photos turned upright as `gsopt sfm` turns them."""
     (work / FOLDER).mkdir()
+    source = Path(data.path)
     if not is_posed(source):
         read, refused = read_photos(find_photos(source), work)
         if not read:
             raise InputError(f"{source} holds no photo that can be used: {refused[0].name}: {refused[0].reason}.")
         return [MaskedPhoto(photo.source.name, photo.path, _mask_path(work, photo.source.name)) for photo in read]
-    dataset = read_dataset(source)
-    frames = [*dataset.frames, *(dataset.held_out or [])]
-    photos = [MaskedPhoto(frame.name, frame.path, _mask_path(work, frame.name)) for frame in frames]
+    photos = [MaskedPhoto(frame.name, frame.path, _mask_path(work, frame.name)) for frame in _frames(data)]
     if len({photo.mask for photo in photos}) < len(photos):
         raise InputError(f"{source} has images that differ by suffix or folder alone. Rename them.")
     return photos
+
+
+def _frames(data: DataConfig) -> list[PosedImage]:
+    """The chosen input views and the held-out ones of a dataset."""
+    train, test = split(read_dataset(Path(data.path)), data)
+    return [*train, *test]
 
 
 def _mask_path(work: Path, name: str) -> Path:
@@ -134,13 +142,13 @@ def _write(photo: MaskedPhoto, probabilities: Float32[np.ndarray, "H W"]) -> Non
 
 
 def _look_closer(
-    source: Path, photos: list[MaskedPhoto], network: MaskNetwork, work: Path, report: Report
+    data: DataConfig, photos: list[MaskedPhoto], network: MaskNetwork, work: Path, report: Report
 ) -> list[str] | None:
     """Run the network on crops until they stay where they are; returns the photos whose masks still disagree, None
     where they cannot be checked."""
     seen: dict[str, Box] = {}
     for _ in range(MAX_ROUNDS):
-        disagreeing, boxes = _boxes(source, photos, work)
+        disagreeing, boxes = _boxes(data, photos, work)
         moved = [photo for photo in photos if _is_new(photo, boxes.get(photo.name), seen.get(photo.name))]
         if not moved:
             return disagreeing
@@ -148,7 +156,7 @@ def _look_closer(
         for photo in moved:
             seen[photo.name] = boxes[photo.name]
             _write(photo, _cropped(photo, boxes[photo.name], network))
-    return _boxes(source, photos, work)[0]
+    return _boxes(data, photos, work)[0]
 
 
 def _is_new(photo: MaskedPhoto, box: Box | None, before: Box | None) -> bool:
@@ -168,10 +176,10 @@ def _cropped(photo: MaskedPhoto, box: Box, network: MaskNetwork) -> Float32[np.n
     return whole
 
 
-def _boxes(source: Path, photos: list[MaskedPhoto], work: Path) -> tuple[list[str] | None, dict[str, Box]]:
+def _boxes(data: DataConfig, photos: list[MaskedPhoto], work: Path) -> tuple[list[str] | None, dict[str, Box]]:
     """Photos whose masks disagree so far, None where that is not known, and the boxes to look at: where the agreeing
     masks say that the others show the object, else around each mask."""
-    found = _agreed(source, work) if is_posed(source) else None
+    found = _agreed(data, work) if is_posed(Path(data.path)) else None
     if found is not None:
         return found
     boxes = {}
@@ -183,14 +191,14 @@ def _boxes(source: Path, photos: list[MaskedPhoto], work: Path) -> tuple[list[st
     return None, boxes
 
 
-def _agreed(source: Path, work: Path) -> tuple[list[str], dict[str, Box]] | None:
-    """Photos that disagree, and boxes for all that do not agree; Returns None where the masks agree on nothing."""
-    scene = load_scene(DataConfig(path=str(source), masks=str(work / FOLDER), cache_mb=0))
-    views = [*scene.train, *scene.test]
-    rows = list(range(len(views)))
+def _agreed(data: DataConfig, work: Path) -> tuple[list[str], dict[str, Box]] | None:
+    """Input views that disagree, and boxes for all photos that do not agree; Returns None where the masks of the input
+    views agree on nothing."""
+    scene = load_scene(replace(data, masks=str(work / FOLDER), downscale=1, depth=None, cache_mb=0))
+    rows = list(range(len(scene.train)))
     if len(rows) > MAX_CHECKED:
-        rows = sorted(farthest_points(torch.cat([view.camera.centers for view in views]), MAX_CHECKED))
-    photos = small_photos([views[row] for row in rows], MAX_CHECKED)
+        rows = sorted(farthest_points(torch.cat([view.camera.centers for view in scene.train]), MAX_CHECKED))
+    photos = small_photos([scene.train[row] for row in rows], MAX_CHECKED)
     focus = find_focus([photo.camera for photo in photos], scene.extent)
     agreement = mask_agreement(photos, focus)
     if agreement is None:
@@ -198,15 +206,20 @@ def _agreed(source: Path, work: Path) -> tuple[list[str], dict[str, Box]] | None
     points = object_points([photos[row] for row in agreement.agreeing], focus)
     right = {rows[row] for row in agreement.agreeing}
     boxes = {}
-    for row, view in enumerate(views):
+    for row, view in enumerate([*scene.train, *scene.test]):
         box = box_of_points(view.camera, points)
         if row not in right and box is not None:
             boxes[view.name] = box
-    return [views[rows[row]].name for row in agreement.disagreeing], boxes
+    return [scene.train[rows[row]].name for row in agreement.disagreeing], boxes
 
 
 def _finished(
-    photos: list[MaskedPhoto], disagreeing: list[str] | None, out: Path, network: MaskNetwork, source: Path, work: Path
+    photos: list[MaskedPhoto],
+    disagreeing: list[str] | None,
+    out: Path,
+    network: MaskNetwork,
+    data: DataConfig,
+    work: Path,
 ) -> MaskFolder:
     """The report, also written beside the masks."""
     empty = [photo.name for photo in photos if np.asarray(Image.open(photo.mask, formats=("PNG",))).max() <= 127]
@@ -215,7 +228,7 @@ def _finished(
     record = {
         "version": RECORD_VERSION,
         "model": network.path.name,
-        "fingerprint": fingerprint(source, network.path),
+        "fingerprint": fingerprint(data, network.path),
         "report": made.lines(),
         "empty": made.empty,
         "disagreeing": made.disagreeing,
@@ -224,22 +237,25 @@ def _finished(
     return made
 
 
-def fingerprint(source: Path, model: Path) -> list[Any]:
-    """The model's digest, then name, size and time of each photo: other masks come of others."""
-    if is_posed(source):
-        dataset = read_dataset(source)
-        paths = [frame.path for frame in (*dataset.frames, *(dataset.held_out or []))]
-    else:
-        paths = find_photos(source)
+def fingerprint(data: DataConfig, model: Path) -> list[Any]:
+    """The model's digest, then name, size and time of each photo, input views first: other masks come of others."""
+    source = Path(data.path)
     digest = sha256(model.read_bytes()).hexdigest()
-    return [digest, *([path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in paths)]
+    if not is_posed(source):
+        return [digest, *map(_stamp, find_photos(source))]
+    train, test = split(read_dataset(source), data)
+    return [digest, *(_stamp(frame.path) for frame in train), *(["held out", *_stamp(frame.path)] for frame in test)]
 
 
-def made_from(folder: Path, source: Path, model: Path) -> bool:
-    """True when the masks in `folder` were made by this model from these very photos."""
+def _stamp(path: Path) -> list[Any]:
+    return [path.name, path.stat().st_size, path.stat().st_mtime_ns]
+
+
+def made_from(folder: Path, data: DataConfig, model: Path) -> bool:
+    """True when the masks in `folder` were made by this model from these very photos, and the same ones held out."""
     record = folder / RECORD
     try:
-        return files.is_regular(record) and files.read_json(record)["fingerprint"] == fingerprint(source, model)
+        return files.is_regular(record) and files.read_json(record)["fingerprint"] == fingerprint(data, model)
     except (InputError, KeyError):
         return False
 
@@ -253,11 +269,11 @@ def with_made_masks(config: DataConfig, folder: Path, report: Report) -> DataCon
     source, network = Path(config.path), MaskNetwork.open(find_model(config.mask_model))
     number = 1
     while (out := folder / f"{source.name}-masks{'' if number == 1 else f'-{number}'}").exists():
-        if made_from(out, source, network.path):
+        if made_from(out, config, network.path):
             report(f"masks made earlier: {out}")
             return replace(config, masks=str(out))
         number += 1
-    for line in cut_out(source, out, network, report).lines():
+    for line in cut_out(config, out, network, report).lines():
         report(line)
     return replace(config, masks=str(out))
 

@@ -47,6 +47,14 @@ class BrownIsTheObject:
         return found
 
 
+class CropIsTheMask(BrownIsTheObject):
+    """Says by its answer which crop it was shown."""
+
+    def probabilities(self, pixels: np.ndarray) -> np.ndarray:
+        height, width = pixels.shape[:2]
+        return super().probabilities(pixels) * (0.6 + 0.4 * (height * width % 97) / 97)
+
+
 @pytest.fixture
 def unmasked(tmp_path: Path) -> Path:
     root = Path(photos(tmp_path / "data", 6).path)
@@ -57,14 +65,19 @@ def unmasked(tmp_path: Path) -> Path:
     return root
 
 
-def test_a_second_look_at_the_hull_of_the_others_loses_the_plinth(unmasked: Path, tmp_path: Path) -> None:
-    for index in (1, 3):
-        path = unmasked / "train" / f"r_{index}.png"
+def put_plinths(root: Path, *indices: int) -> None:
+    """White below the balls, which the network takes along where it sees the whole photo."""
+    for index in indices:
+        path = root / "train" / f"r_{index}.png"
         pixels = np.array(Image.open(path))
         pixels[84:] = 255
         Image.fromarray(pixels).save(path)
+
+
+def test_a_second_look_at_the_hull_of_the_others_loses_the_plinth(unmasked: Path, tmp_path: Path) -> None:
+    put_plinths(unmasked, 1, 3)
     network = BrownIsTheObject(tmp_path / "net.onnx")
-    made = cut_out(unmasked, None, network)
+    made = cut_out(DataConfig(path=str(unmasked)), None, network)
     assert made.path == unmasked / "masks"
     assert made.checked
     assert made.disagreeing == []
@@ -78,13 +91,30 @@ def test_a_second_look_at_the_hull_of_the_others_loses_the_plinth(unmasked: Path
     assert any(size != (SIZE, SIZE) for size in network.sizes)
 
 
+def test_held_out_photos_decide_nothing_about_input_views(unmasked: Path, tmp_path: Path) -> None:
+    """Whatever a held-out photo shows, the masks of the input views keep their bytes; photos that are no input view and
+    not held out get none."""
+    put_plinths(unmasked, 3)
+    data = DataConfig(path=str(unmasked), eval=True, view_ids=(1, 2, 3, 4))
+    scene = load_scene(data)
+    assert len(scene.test) == 1
+    made = []
+    for color in (None, (200, 40, 40), (40, 40, 200)):
+        if color is not None:
+            Image.new("RGB", (SIZE, SIZE), color).save(unmasked / scene.test[0].name)
+        out = tmp_path / f"cut-{color}"
+        assert cut_out(data, out, CropIsTheMask(tmp_path / "net.onnx")).count == 5
+        made.append([(out / "train" / Path(view.name).name).read_bytes() for view in scene.train])
+    assert made[0] == made[1] == made[2]
+
+
 def test_photos_without_poses_get_masks_under_their_names(unmasked: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     for name in ("a b.JPG", "c.png"):
         large = Image.open(unmasked / "train" / "r_0.png").resize((200, 240))
         large.rotate(1 + len(name), fillcolor=(20, 150, 60)).save(folder / name)
-    made = cut_out(folder, tmp_path / "cut", BrownIsTheObject(tmp_path / "net.onnx"))
+    made = cut_out(DataConfig(path=str(folder)), tmp_path / "cut", BrownIsTheObject(tmp_path / "net.onnx"))
     assert sorted(path.name for path in made.path.iterdir()) == ["a b.png", "c.png", RECORD]
     assert Image.open(made.path / "c.png").size == (200, 240)
     assert not made.checked
@@ -92,17 +122,17 @@ def test_photos_without_poses_get_masks_under_their_names(unmasked: Path, tmp_pa
 
 def test_nothing_is_overwritten(unmasked: Path, tmp_path: Path) -> None:
     network = BrownIsTheObject(tmp_path / "net.onnx")
-    cut_out(unmasked, None, network)
+    cut_out(DataConfig(path=str(unmasked)), None, network)
     before = (unmasked / "masks" / RECORD).read_bytes()
     with pytest.raises(UsageError, match="must not exist yet"):
-        cut_out(unmasked, None, network)
+        cut_out(DataConfig(path=str(unmasked)), None, network)
     assert (unmasked / "masks" / RECORD).read_bytes() == before
 
 
 def test_a_failure_leaves_nothing_behind(unmasked: Path, tmp_path: Path) -> None:
     (unmasked / "train" / "r_3.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"r_3\.png"):
-        cut_out(unmasked, tmp_path / "cut", BrownIsTheObject(tmp_path / "net.onnx"))
+        cut_out(DataConfig(path=str(unmasked)), tmp_path / "cut", BrownIsTheObject(tmp_path / "net.onnx"))
     assert not (tmp_path / "cut").exists()
     assert not [path for path in tmp_path.iterdir() if path.name.endswith(".tmp")]
 
@@ -111,7 +141,7 @@ def test_a_photo_without_the_object_is_named(unmasked: Path, tmp_path: Path) -> 
     Image.new("RGB", (SIZE, SIZE), (0, 90, 0)).save(unmasked / "train" / "r_4.png")
     network = BrownIsTheObject(tmp_path / "net.onnx")
     network.probabilities = lambda pixels: (pixels[..., 0].astype(int) > pixels[..., 1]).astype(np.float32)  # type: ignore[method-assign]
-    made = cut_out(unmasked, None, network)
+    made = cut_out(DataConfig(path=str(unmasked)), None, network)
     assert made.empty == ["train/r_4.png"]
     assert any("r_4.png" in line and "no object" in line for line in made.lines())
 
