@@ -41,7 +41,9 @@ class Flags:
     base: Annotated[str | None, arg(metavar="PRIOR")] = None
     """Prior to start from: `embedded` or a folder; random weights when not given."""
     threads: int = 0
-    """CPU threads of the reconstructions and of the network; 0 = all."""
+    """CPU threads of the network, and reconstructions at a time on this machine; 0 = one per core."""
+    farm: Annotated[str, arg(metavar="local|ray")] = "local"
+    """Where the reconstructions run: local, local:CORES, ray or ray://HOST:PORT."""
     on_views: FlagCreatePairsOff[bool] = False
     """Train Stable Diffusion on images instead, by LoRA: gsopt finetune --on-views --help lists its flags."""
     library: FlagCreatePairsOff[bool] = False
@@ -73,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
 
     train, held = find_scenes(flags.data, flags.val)
     scenes = TrainingScenes(train, held, flags.fits, flags.size, flags.config.seed)
-    evaluation = start(scenes, flags.config, flags.out, flags.base, flags.threads, report)
+    evaluation = start(scenes, flags.config, flags.out, flags.base, flags.threads, flags.farm, report)
     if evaluation:
         best = max(evaluation["repair"].values())
         print(f"held out: renders {evaluation['render']:.2f} dB, repaired {best:.2f} dB")

@@ -15,6 +15,8 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.data.files import read_json
 from gsopt.errors import InputError
 from gsopt.events import Report
+from gsopt.farm.job import Farm
+from gsopt.farm.open import available_cores, open_farm
 from gsopt.finetune.caption_tokens import SceneCaptions, encode_captions
 from gsopt.finetune.claimed_folder import claim
 from gsopt.finetune.evaluation import evaluate, sample_sheet
@@ -24,8 +26,6 @@ from gsopt.finetune.scenes import TrainingScenes
 from gsopt.finetune.text_encoder import evaluate_encoder, make_encoder, scene_texts
 from gsopt.finetune.trainer import STATE, PriorTrainer
 from gsopt.finetune.training_config import PriorTrainingConfig
-from gsopt.raster.api import make_backend
-from gsopt.raster.backend import Backend
 from gsopt.sds.priors.view_conditioned import (
     CARD_FILE,
     CLIP_FOLDER,
@@ -43,25 +43,31 @@ LOSS_SMOOTHING = 0.02
 
 
 def start(
-    scenes: TrainingScenes, config: PriorTrainingConfig, out: Path, base: str | None, threads: int, report: Report
+    scenes: TrainingScenes,
+    config: PriorTrainingConfig,
+    out: Path,
+    base: str | None,
+    threads: int,
+    farm: str,
+    report: Report,
 ) -> dict[str, Any]:
-    """Runs `finetune` on this machine's compiled backend; `base` as on the command line."""
+    """Runs `finetune`; `base` and `farm` as on the command line."""
     if threads:
         torch.set_num_threads(threads)
     folder = None if base is None else EMBEDDED if base == "embedded" else Path(base)
-    return finetune(scenes, config, out, make_backend("cpu", threads), folder, report)
+    return finetune(scenes, config, out, open_farm(farm, threads or available_cores()), folder, report)
 
 
 def finetune(
-    scenes: TrainingScenes, config: PriorTrainingConfig, out: Path, backend: Backend, base: Path | None, report: Report
+    scenes: TrainingScenes, config: PriorTrainingConfig, out: Path, farm: Farm, base: Path | None, report: Report
 ) -> dict[str, Any]:
-    """Trains a prior into `out` and returns its evaluation on the held-out scenes.
+    """Has `farm` reconstruct the scenes, trains a prior into `out` and returns its evaluation on the held-out scenes.
 
     Resumes after a kill. Raises InputError for scenes that cannot be read and for an `out`
     that holds something else.
     """
     _claim_folder(out, scenes, config, base)
-    train, val = (_library(paths, scenes, out / "pairs", backend, report) for paths in (scenes.train, scenes.val))
+    train, val = (_library(paths, scenes, out / "pairs", farm, report) for paths in (scenes.train, scenes.val))
     assert train is not None
     held = 0 if val is None else len(val.pairs)
     report(f"{len(train.pairs)} renders of {len(scenes.train)} scenes to train on, {held} held out")
@@ -102,11 +108,11 @@ def _claim_folder(out: Path, scenes: TrainingScenes, config: PriorTrainingConfig
 
 
 def _library(
-    paths: Sequence[Path], scenes: TrainingScenes, folder: Path, backend: Backend, report: Report
+    paths: Sequence[Path], scenes: TrainingScenes, folder: Path, farm: Farm, report: Report
 ) -> PairCache | None:
     if not paths:
         return None
-    return collect_pairs(paths, scenes.reconstructions, scenes.size, scenes.seed, folder, backend, report)
+    return collect_pairs(paths, scenes.reconstructions, scenes.size, scenes.seed, folder, farm, report)
 
 
 def _base(folder: Path, captions: bool) -> Any:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from in_process_farm import InProcess
 
-from gsopt.finetune import pair_cache
+from gsopt.errors import InputError
+from gsopt.finetune import pair_cache, serve_pairs
 from gsopt.finetune.batches import REPAIR_SHARE, TRAINING_SIDE, TYPICAL_ERROR, Batch, draw_batch, on_background
 from gsopt.finetune.reconstruction_pairs import Pairs
-from gsopt.raster.backend import Backend
-from gsopt.raster.reference import ReferenceBackend
 from gsopt.sds.priors.view_conditioned import INPUT_CHANNELS, MAX_REFERENCES, cosine_schedule
 
 NOISE = cosine_schedule()
@@ -110,19 +112,38 @@ def test_the_same_generator_draws_the_same_batch() -> None:
         assert torch.equal(a, b)
 
 
-def test_pairs_serve_again_only_for_the_same_scene_size_and_seed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[tuple[Path, int, int]] = []
+def test_pairs_serve_again_only_for_the_same_scene_size_and_seed(tmp_path: Path) -> None:
+    made: list[tuple[str, int, int]] = []
 
-    def make(scene: Path, size: int, fit: int, seed: int, backend: Backend) -> Pairs:
-        made.append((scene, size, seed))
-        return perfect_pairs(1)
+    def handle(request: Mapping[str, Any]) -> int:
+        made.append((request["scene"], request["size"], request["seed"]))
+        Path(request["out"]).mkdir()
+        perfect_pairs(1).save(Path(request["out"]) / serve_pairs.PAIRS)
+        return 1
 
-    monkeypatch.setattr(pair_cache, "make_pairs", make)
     calls = [("a", 80, 0), ("a", 80, 0), ("a", 64, 0), ("a", 80, 1), ("b", 80, 0)]
     for root, size, seed in calls:
-        pair_cache.collect_pairs(
-            [tmp_path / root / "cup"], 1, size, seed, tmp_path / "pairs", ReferenceBackend(), print
-        )
-    assert made == [(tmp_path / root / "cup", size, seed) for root, size, seed in calls[1:]]
+        scene = tmp_path / root / "cup"
+        pair_cache.collect_pairs([scene], 1, size, seed, tmp_path / "pairs", InProcess(handle), print)
+    assert made == [(str(tmp_path / root / "cup"), size, seed) for root, size, seed in calls[1:]]
+
+
+def test_what_cannot_be_reconstructed_is_named_and_left_out(tmp_path: Path) -> None:
+    """The others keep their pairs, each with its scene; nothing at all is an error."""
+
+    def handle(request: Mapping[str, Any]) -> int:
+        count = {"cup": 2, "jar": 0, "pot": 3}[Path(request["scene"]).name]
+        if not count or request["index"] > 1:
+            raise InputError("It has one view.")
+        Path(request["out"]).mkdir()
+        perfect_pairs(count).save(Path(request["out"]) / serve_pairs.PAIRS)
+        return count
+
+    scenes, lines = [tmp_path / name for name in ("jar", "cup", "pot")], list[str]()
+    cache = pair_cache.collect_pairs(scenes, 3, 80, 0, tmp_path / "pairs", InProcess(handle), lines.append)
+    assert cache.scenes == tuple(scenes[1:])
+    assert cache.scene.tolist() == [0] * 4 + [1] * 6
+    assert len(cache.pairs) == 10
+    assert sum("is left out: It has one view." in line for line in lines) == 5
+    with pytest.raises(InputError, match="None of the 1 scenes"):
+        pair_cache.collect_pairs(scenes[:1], 3, 80, 0, tmp_path / "pairs", InProcess(handle), lines.append)

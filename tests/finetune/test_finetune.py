@@ -15,8 +15,10 @@ from gsopt.cli import main
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import InitConfig
 from gsopt.errors import InputError, UsageError
-from gsopt.finetune import evaluation, reconstruction_pairs
+from gsopt.farm.local import LocalFarm
+from gsopt.finetune import evaluation, reconstruction_pairs, run
 from gsopt.finetune.batches import draw_batch
+from gsopt.finetune.pair_cache import collect_pairs
 from gsopt.finetune.reconstruction_pairs import Pairs, make_pairs, render_pairs, whole_scene
 from gsopt.finetune.scenes import TrainingScenes
 from gsopt.finetune.trainer import STATE, PriorTrainer, loss
@@ -28,6 +30,7 @@ from gsopt.sds.priors.protocol import Condition
 from gsopt.sds.priors.view_conditioned import INPUT_CHANNELS, ViewPrior, make_unet, predict
 
 pytest.importorskip("diffusers")
+from in_process_farm import InProcess
 from tiny_scenes import write_dataset
 
 SIZE = 64
@@ -37,6 +40,7 @@ SIZE = 64
 def short_fits() -> None:
     """Fits of a handful of steps, few renders to measure on: how much is learned is not what is tested."""
     reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2
+    run.open_farm = lambda name, cpus: InProcess()
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +54,21 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pairs(scenes: Path) -> Pairs:
     return make_pairs(scenes / "one", SIZE, 0, 0, make_backend("cpu", 1))
+
+
+def test_a_worker_of_a_farm_makes_the_same_pairs(scenes: Path, tmp_path: Path) -> None:
+    """Processes of their own, beside the same reconstructions in this one: the same bytes, and no partial folder."""
+    out, lengths = [tmp_path / name / "pairs" for name in ("here", "there")], reconstruction_pairs.STEP_COUNTS
+    reconstruction_pairs.STEP_COUNTS = (600, 1000, 1600)  # those of a worker, which no fixture reaches
+    try:
+        for folder, farm in zip(out, (InProcess(), LocalFarm(2)), strict=True):
+            collect_pairs([scenes / "one"], 1, 32, 5, folder, farm, print)
+    finally:
+        reconstruction_pairs.STEP_COUNTS = lengths
+    here, there = (sorted(path.relative_to(folder) for path in folder.rglob("*")) for folder in out)
+    assert here == there
+    (name,) = (path for path in here if path.suffix)
+    assert (out[0] / name).read_bytes() == (out[1] / name).read_bytes()
 
 
 @pytest.fixture(scope="module")

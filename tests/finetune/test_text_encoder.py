@@ -21,6 +21,7 @@ from gsopt.sds.priors.protocol import Condition
 from gsopt.sds.priors.view_conditioned import TOKEN_WIDTH, TextTokens, make_unet, predict, zero_text_attention
 
 pytest.importorskip("diffusers")
+from in_process_farm import InProcess
 from tiny_scenes import write_dataset
 
 SIZE = 64
@@ -30,6 +31,7 @@ CAPTIONS = {"one": "a red cup", "two": "a blue table", "three": "a red table"}
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> None:
     reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2
+    run.open_farm = lambda name, cpus: InProcess()
 
 
 @pytest.fixture(scope="module")
