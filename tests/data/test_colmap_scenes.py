@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from dataset_builders import POINTS, SIZE, colmap, ring, save_image
 from PIL import Image
 
 from gsopt.config.train import DataConfig
-from gsopt.data.colmap_files import CAMERA_MODELS
+from gsopt.data.colmap import _camera_model
+from gsopt.data.colmap_files import CAMERA_MODELS, CameraRecord
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError
 from gsopt.init.neighbors import mean_neighbor_distance
@@ -208,3 +210,13 @@ def test_declared_and_actual_size_are_both_named(tmp_path: Path) -> None:
     Image.new("RGB", (12, 16)).save(tmp_path / "images" / "im 006.png")
     with pytest.raises(InputError, match=r"im 006\.png is 12x16 pixels, but the dataset declares 16x16"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(("model", "params"), [("SIMPLE_PINHOLE", [0, 8, 8]), ("PINHOLE", [20, 0, 8, 8])])
+@pytest.mark.parametrize("sign", [0.0, -1.0])
+def test_a_focal_length_that_is_not_positive_is_refused(model: str, params: list[float], sign: float) -> None:
+    camera = CameraRecord(1, model, 16, 16, tuple(value or sign for value in params))
+    with pytest.raises(InputError, match="all must be positive"):
+        _camera_model(camera, "here")
+    K, _ = _camera_model(replace(camera, params=tuple(value or 1e-3 for value in params)), "here")
+    assert float(K.diagonal()[:2].min()) == 1e-3

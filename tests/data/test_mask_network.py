@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsopt.data.mask_network import IMAGENET, NOTHING, PLAIN, MaskNetwork
+from gsopt.data.mask_network import IMAGENET, MAX_SIDE, NOTHING, PLAIN, MaskNetwork
 from gsopt.errors import InputError
 
 
@@ -75,3 +76,34 @@ def test_the_input_is_normalized_as_the_authors_of_the_network_do(side: int, nor
 def test_a_network_that_gives_no_image_is_named(answer: Callable[[np.ndarray], np.ndarray]) -> None:
     with pytest.raises(InputError, match=r"net\.onnx gives no mask"):
         network(lambda x: np.ones(shape))[0].probabilities(gray(40, 40))
+
+
+@pytest.mark.parametrize(
+    ("shapes", "side"),
+    [
+        ([[1, 3, 320, 320]], 320),
+        ([["batch", 3, "height", "width"]], 320),
+        ([[1, 3, 32, 32]], 32),
+        ([[1, 3, MAX_SIDE, MAX_SIDE]], MAX_SIDE),
+        ([[1, 3, 31, 31]], None),
+        ([[1, 3, MAX_SIDE + 1, MAX_SIDE + 1]], None),
+        ([[1, 3, 320, 240]], None),
+        ([[1, 4, 320, 320]], None),
+        ([[3, 320, 320]], None),
+        ([[1, 3, 320, 320]] * 2, None),
+        ([], None),
+    ],
+)
+def test_a_network_takes_one_square_image(
+    shapes: list[list[Any]], side: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = [SimpleNamespace(shape=shape) for shape in shapes]
+    session = SimpleNamespace(get_inputs=lambda: inputs)
+    package: Any = SimpleNamespace(SessionOptions=SimpleNamespace, InferenceSession=lambda *_, **__: session)
+    monkeypatch.setitem(sys.modules, "onnxruntime", package)
+    (tmp_path / "net.onnx").write_bytes(b"onnx")
+    if side is None:
+        with pytest.raises(InputError, match="one square RGB image is needed"):
+            MaskNetwork.open(tmp_path / "net.onnx")
+    else:
+        assert MaskNetwork.open(tmp_path / "net.onnx").side == side

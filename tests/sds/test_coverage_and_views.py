@@ -102,6 +102,14 @@ def test_the_surface_of_its_own_pixel_hides_a_ball(shape: tuple[int, int]) -> No
         assert coverage.seen(balls, eye, backend).tolist() == pytest.approx([float(share < 1)] * len(means), abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("size", "small"), [((512, 256), (128, 64)), ((256, 512), (64, 128)), ((100, 60), (100, 60)), ((4000, 2), (128, 1))]
+)
+def test_the_longer_side_of_a_depth_map_is_bounded(size: tuple[int, int], small: tuple[int, int]) -> None:
+    found = coverage._small(camera(0.0, width=size[0], height=size[1]))
+    assert (found.width, found.height) == small
+
+
 def test_every_view_that_sees_it_adds_up_and_uncertainty_falls() -> None:
     inputs = [camera(azimuth) for azimuth in (0, 10, -10, 20)]
     means = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import tiny_sd21
@@ -94,6 +95,22 @@ def test_pipelines_of_one_model_that_predict_eps_v_and_x0_agree(sd21_copy: Path,
         found[kind] = policies.sds(other, z, seen).g
     torch.testing.assert_close(found["epsilon"], found["v_prediction"], rtol=0, atol=1e-4)
     torch.testing.assert_close(found["sample"], found["v_prediction"], rtol=0, atol=1e-4)
+
+
+def test_the_autoencoder_is_given_and_gives_colors_from_minus_1_to_1(sd21: Path, monkeypatch) -> None:
+    prior = opened(sd21)
+    images, given = torch.rand(1, 3, 64, 64), []
+    images[..., 0, 0], images[..., 0, 1] = 0.0, 1.0
+
+    def encode(x: torch.Tensor) -> SimpleNamespace:
+        given.append(x)
+        return SimpleNamespace(latents=x)
+
+    monkeypatch.setattr(prior.vae, "encode", encode)
+    monkeypatch.setattr(prior.vae, "decode", lambda x: SimpleNamespace(sample=x))
+    back = prior.decode(prior.encode(images))
+    assert (float(given[0].min()), float(given[0].max())) == (-1.0, 1.0)
+    torch.testing.assert_close(back, images, rtol=0, atol=1e-6)
 
 
 def test_no_gradient_reaches_any_network_and_one_reaches_the_image(sd21: Path) -> None:

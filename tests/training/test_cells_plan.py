@@ -53,6 +53,13 @@ def test_a_model_of_fewer_places_than_cells_is_refused() -> None:
             split(places.double(), 4)
 
 
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_as_many_places_as_cells_are_enough(count: int) -> None:
+    places = torch.arange(2.0 * count).reshape(count, 2).double()
+    cells = [Cell("", *box, (0.5, 0.5), (), 1) for box in split(places, count)]
+    assert [int(cell.holds(places).sum()) for cell in cells] == [1] * count
+
+
 def test_a_view_belongs_to_the_cells_that_draw_it_and_no_cell_goes_without() -> None:
     shares = torch.tensor([0.5, 0.04, 0.06] * 4)
     assert relevant(shares).tolist() == [True, False, True] * 4

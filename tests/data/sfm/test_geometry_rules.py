@@ -173,6 +173,16 @@ def test_a_mask_keeps_matches_whose_two_ends_are_lighter_than_half(tmp_path: Pat
     assert found.points((1, 2))[0].tolist() == pairs.keypoints[1][[1, 2, 3]].tolist()
 
 
+def test_a_match_is_shown_by_the_pixel_that_it_lies_in(tmp_path: Path) -> None:
+    levels = np.random.default_rng(3).integers(0, 2, (5, 7)).astype(np.uint8) * 255
+    Image.fromarray(levels).save(tmp_path / "a.png")
+    rows, columns = np.indices(levels.shape).reshape(2, -1)
+    pairs = matched({(1, 2): levels.size})
+    pairs.keypoints[1][: levels.size] = np.column_stack([columns, rows]) + 0.5
+    kept = pair_matches.inside(pairs, tmp_path).matches[1, 2][:, 0]
+    assert kept.tolist() == np.flatnonzero(levels).tolist()
+
+
 def test_the_background_of_all_photos_is_shifted_as_most_pairs_say() -> None:
     """Three photos whose backgrounds lie at 0, 4 and 10 px; one pair that disagrees by 30 px pulls little."""
     pairs = matched({(1, 2): 20, (1, 3): 20, (2, 3): 20})

@@ -86,3 +86,23 @@ def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     inputs: Any = SimpleNamespace(kind="none", masks=None)
     assert run._few(project, [], inputs, graph(CHAIN), None) == ("another graph", None)
     assert looks == [True]
+
+
+@pytest.mark.parametrize(
+    ("found", "repaired"), [([], False), ([5], False), ([4], True), ([5, 3], False), ([4, 3], True), ([3, 2], True)]
+)
+def test_the_largest_of_global_reconstructions_is_repaired_where_photos_are_missing(
+    found: list[int], repaired: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    calls: list[list[Any]] = []
+    models = [SimpleNamespace(count=count, num_reg_images=lambda count=count: count) for count in found]
+    monkeypatch.setattr(mapping, "_global", lambda *_: list(models))
+    monkeypatch.setattr(mapping, "keep_coherent", lambda model: None)
+    monkeypatch.setattr(mapping, "registered", lambda model: {f"{i}.png" for i in range(model.count)})
+    monkeypatch.setattr(mapping, "_repaired", lambda project, models, target: calls.append(models) or models)
+    project: Any = SimpleNamespace(
+        pycolmap=SimpleNamespace(set_random_seed=lambda seed: None), config=SfmConfig(), database=tmp_path / "a.db"
+    )
+    placed = mapping.run_mapper(project, "hybrid", SimpleNamespace(features=dict.fromkeys(range(5), 9)))  # type: ignore[arg-type]
+    assert bool(calls) == repaired
+    assert [model.count for model in placed] == [count for count in found if count >= 3]
