@@ -7,6 +7,8 @@ back. Pixar's library (usd-core) parses the files.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +33,7 @@ from gsopt.geometry.quats import normalize
 _KIND, _NOTES = "ParticleField3DGaussianSplat", "gsopt"
 _SH, _DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
 _OPACITY_MARGIN = 2.0**-24
+_PROBE = Path(__file__).with_name("usd_probe.py")
 _EXTENT = 3.0
 """Standard deviations around a mean that the extent of the prim holds."""
 _Y_FROM_Z_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
@@ -116,7 +119,14 @@ def _as_bad_data(path: Path) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        raise InputError(f"{path} is no USD: {shortened(str(error))}. Copy or export it again.") from error
+        raise InputError(f"{path} is no USD: {shortened(_text(error))}. Copy or export it again.") from error
+
+
+def _text(error: Exception) -> str:
+    try:
+        return str(error)
+    except UnicodeDecodeError:  # a message of the library repeats the file's bytes
+        return type(error).__name__
 
 
 def usd_units(path: Path) -> Units:
@@ -132,6 +142,7 @@ def _layer(path: Path) -> Any:
     """The file alone, read anew."""
     sdf = require("pxr.Sdf", "usd", "USD")
     with opened(path):
+        require_survivable(path)
         layer = sdf.Layer.OpenAsAnonymous(str(path))
     if layer is None:
         raise InputError(f"{path} is no USD. Copy or export it again.")
@@ -139,6 +150,14 @@ def _layer(path: Path) -> Any:
     if others:
         raise InputError(f"{path} refers to other files, such as {shortened(others[0])}. Run `usdcat --flatten` first.")
     return layer
+
+
+def require_survivable(path: Path) -> None:
+    """InputError where the library would end this process."""
+    probe = [sys.executable, "-P", str(_PROBE), str(path.absolute())]
+    done = subprocess.run(probe, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    if done.returncode not in (0, 1):
+        raise InputError(f"{path} is no USD: the library that reads USD crashes over it. Copy or export it again.")
 
 
 def _read(prim: Any, means: Tensor, path: Path) -> Gaussians:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,33 @@ def test_a_damaged_file_is_one_line_and_exit_code_3(tmp_path: Path, capfd: pytes
             assert main(["export", str(tmp_path / name), "-o", str(tmp_path / "c.ply")]) == 3, bytes_[:40]
             assert len([line for line in capfd.readouterr().err.splitlines() if line.startswith("gsopt: ")]) == 1
     assert not (tmp_path / "c.ply").exists()
+
+
+def test_bytes_that_are_no_text_are_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The library's own message repeats them, which cannot be printed."""
+    monkeypatch.setattr("gsopt.formats.usd.require_survivable", lambda path: None)  # half a second each
+    save_splats(tmp_path / "a.usda", make_splats(2))
+    data = (tmp_path / "a.usda").read_bytes()
+    for at in range(0, len(data), 7):
+        (tmp_path / "b.usda").write_bytes(data[:at] + b"\xf6" + data[at + 1 :])
+        with contextlib.suppress(InputError):
+            load_splats(tmp_path / "b.usda")
+
+
+def test_a_file_over_which_the_library_ends_its_process_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two changes of one byte that usd-core 26 aborts over; then any program that ends so."""
+    save_splats(tmp_path / "a.usdc", make_splats(3, degree=1))
+    data = (tmp_path / "a.usdc").read_bytes()
+    for at, value in ((97, b"\xff"), (99, b"\1")):
+        (tmp_path / "b.usdc").write_bytes(data[:at] + value + data[at + 1 :])
+        with contextlib.suppress(InputError):
+            load_splats(tmp_path / "b.usdc")
+    (tmp_path / "ends.py").write_text("import os; os.abort()")
+    monkeypatch.setattr("gsopt.formats.usd._PROBE", tmp_path / "ends.py")
+    with pytest.raises(InputError, match=r"a\.usdc is no USD: the library that reads USD crashes over it"):
+        load_splats(tmp_path / "a.usdc")
 
 
 def test_sheared_splats_are_refused(tmp_path: Path) -> None:
