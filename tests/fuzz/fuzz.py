@@ -32,9 +32,9 @@ MEMORY = 1 << 30
 
 
 def limit_memory() -> None:
-    """Address space as it is now and MEMORY more."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY,) * 2)
+    """Address space as it is now and MEMORY more; a child, which libFuzzer starts to merge, sets a limit of its own."""
+    pages, (_, most) = int(Path("/proc/self/statm").read_text().split()[0]), resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, most))
 
 
 def main() -> None:

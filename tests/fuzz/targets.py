@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import tempfile
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 from ksplat_files import ksplat
@@ -87,6 +89,28 @@ def short_ksplats(folder: Path) -> list[bytes]:
     return [whole[:48] + whole[4096:4144] + whole[5120:] for whole in (ksplat(level, 3, 1) for level in range(3))]
 
 
+@cache
+def sog_members() -> dict[str, bytes]:
+    """The files of a valid .sog."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_splats(Path(folder, "a.sog"), cloud(3, seed=0))
+        with zipfile.ZipFile(Path(folder, "a.sog")) as archive:
+            return {name: archive.read(name) for name in archive.namelist()}
+
+
+def packed_sog(path: Path) -> None:
+    """This target puts its input into a valid .sog, with the checksum that no change of the archive's bytes keeps."""
+    whole = path.with_name("a.sog")
+    with zipfile.ZipFile(whole, "w") as archive:
+        for name, data in {**sog_members(), path.name: path.read_bytes()}.items():
+            archive.writestr(name, data)
+    reads_or_refuses(whole)
+
+
+def in_a_sog(name: str) -> Target:
+    return Target(name, packed_sog, lambda folder: [sog_members()[name]])
+
+
 def saved(suffix: str) -> Callable[[Path], list[bytes]]:
     def seeds(folder: Path) -> list[bytes]:
         path = folder / f"seed{suffix}"
@@ -145,6 +169,8 @@ CONFIG = json.dumps({"config": TrainConfig().to_dict()}).encode()
 
 TARGETS = {
     **{f"splats{suffix}": Target(f"a{suffix}", reads_or_refuses, saved(suffix)) for suffix in SUFFIXES},
+    "sog meta.json": in_a_sog("meta.json"),
+    "sog means": in_a_sog("means_l.webp"),
     "splats.ksplat": Target("short.ksplat", padded_ksplat, short_ksplats),
     "points.ply": Target("points.ply", clear(pointcloud.read_points_ply), saved(".ply")),
     "transforms.json": Target(
