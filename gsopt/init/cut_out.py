@@ -83,7 +83,7 @@ class MaskFolder:
 
 def cut_out(data: DataConfig, out: Path | None, network: MaskNetwork, report: Report = lambda line: None) -> MaskFolder:
     """Write a soft mask for every photo (posed or not) that `data` chooses to `out`, by default its folder masks/.
-    What held-out photos show changes no mask of an input view.
+    Held-out photos change no mask of an input view, whatever they show.
 
     Raises UsageError when `out` holds something, InputError for photos that cannot be read. `out` appears when it is
     complete.
