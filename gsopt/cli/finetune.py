@@ -43,7 +43,7 @@ class Flags:
     threads: int = 0
     """CPU threads of the network, and reconstructions at a time on this machine; 0 = one per core."""
     farm: Annotated[str, arg(metavar="local|ray")] = "local"
-    """Where the reconstructions run: local, local:CORES, ray or ray://HOST:PORT."""
+    """The machines that reconstruct: local, local:CORES, ray or ray://HOST:PORT."""
     on_views: FlagCreatePairsOff[bool] = False
     """Train Stable Diffusion on images instead, by LoRA: gsopt finetune --on-views --help lists its flags."""
     library: FlagCreatePairsOff[bool] = False
