@@ -91,7 +91,7 @@ def own(head: Path, out: Path, model: Path) -> Path:
         rows = np.load(head / "poses_bounds.npy", allow_pickle=False)[[every.index(name) for name in names]]
         np.save(photos / "poses_bounds.npy", rows)
     if not (photos / "masks").exists():
-        cut_out(DataConfig(path=str(photos)), None, MaskNetwork.open(model), print)
+        cut_out(gsopt.DataConfig(path=str(photos)), None, MaskNetwork.open(model), print)
     return photos / "masks"
 
 
