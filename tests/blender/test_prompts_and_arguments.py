@@ -198,7 +198,7 @@ def test_gsopt_prompts_takes_the_flags(tmp_path: Path) -> None:
     flags = tyro.cli(Flags, args=arguments.prompts(Path("python"), writing, tmp_path / "p.json")[4:])
     assert (flags.notes, flags.domain, flags.n) == ("-- a chair; rm", "medicine", 6)
     assert (flags.llm, flags.model, flags.images) == ("http://localhost:1/v1", "qwen", (tmp_path,))
-    assert flags.output == tmp_path / "p.json"
+    assert flags.out == tmp_path / "p.json"
 
 
 def test_synth_views_takes_the_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
