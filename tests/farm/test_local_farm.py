@@ -18,7 +18,10 @@ from gsopt.errors import UsageError
 from gsopt.farm.job import PARTIAL, Job, Outcome, relocated
 from gsopt.farm.local import LocalFarm
 from gsopt.farm.open import open_farm
+from gsopt.farm.worker import serving
+from gsopt.raster.cpu_backend import ISA_VARIABLE
 
+DEMO = Path(__file__).resolve().parents[2] / "gsopt" / "demo"
 DRIVER = """
 import sys
 sys.path[:0] = {paths!r}
@@ -218,3 +221,13 @@ def test_a_farm_of_another_name_is_refused(name: str) -> None:
 def test_a_farm_by_its_name() -> None:
     assert str(open_farm("local", 3)) == "this machine, 3 cores"
     assert str(open_farm("local:1", 3)) == "this machine, 1 core"
+
+
+def test_a_machine_without_the_drivers_instruction_set_is_named(tmp_path: Path) -> None:
+    """The bits of a run are promised per instruction set: a worker that lacks it takes no other."""
+    words = ["train", str(DEMO), "-m", str(tmp_path / "run"), "--iterations", "1"]
+    one = Job("demo", serving("gsopt.cli.serve_jobs"), {"arguments": words}, environment={ISA_VARIABLE: "sse9"})
+    (outcome,) = LocalFarm(1).run([one])
+    assert outcome.answer != 0
+    assert "instruction set `sse9` is not available here" in outcome.output
+    assert not (tmp_path / "run" / "splat.ply").exists()

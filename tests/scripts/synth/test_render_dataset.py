@@ -260,6 +260,19 @@ def test_an_object_survives_the_pipe() -> None:
     assert read_request(json.loads(json.dumps(job.request))) == (item, SETTINGS, 5, Path("/out/стул 3"))
 
 
+def test_a_machine_without_blender_is_named(two_balls: Path, tmp_path: Path) -> None:
+    """A node of a farm that lacks `bpy` costs the objects it took, with the line that installs it; nothing is left."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.util as util\nfind = util.find_spec\n"
+        "util.find_spec = lambda name, package=None: None if name == 'bpy' else find(name, package)\n"
+    )
+    job = render_job(Item("balls", two_balls), SETTINGS, 0, tmp_path / "out" / "balls", 60.0, None)
+    (outcome,) = LocalFarm(1).run([replace(job, environment={"PYTHONPATH": str(tmp_path)})])
+    assert outcome.ending != "done"
+    assert "pip install bpy" in outcome.error
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 # The command line
 
 
