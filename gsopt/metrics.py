@@ -71,8 +71,10 @@ def object_psnr(
 
 def _squared_error(rendered: Float[Tensor, "B H W 3"], truth: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W"]:
     """Mean over the channels, float64; planes in turn, which is three times as fast as their mean in memory's order."""
-    planes = zip(rendered.unbind(3), truth.unbind(3), strict=True)
-    return sum((a.double() - b.double()).square() for a, b in planes) / 3  # type: ignore[return-value]
+    total = torch.zeros(rendered.shape[:3], dtype=torch.float64, device=rendered.device)
+    for a, b in zip(rendered.unbind(3), truth.unbind(3), strict=True):
+        total += (a.double() - b.double()).square()
+    return total / 3
 
 
 def _decibels(mse: Float[Tensor, "B"]) -> Float[Tensor, "B"]:

@@ -65,7 +65,7 @@ def _bound(arg: Any) -> tuple[int, Any]:
 
 
 class FakeLibrary:
-    """What compile_shader returns."""
+    """The library of kernels that compile_shader returns."""
 
     def __init__(self, source: str, order: Order) -> None:
         self.launched: list[str] = []

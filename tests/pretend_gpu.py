@@ -29,7 +29,7 @@ MIXED = ("aten::_to_copy", "aten::copy_", "aten::index", "aten::index_put_")
 
 
 class Place:
-    """Where the pretended tensors lie."""
+    """The memory that holds the pretended tensors."""
 
     device = GPU
     current = 0
@@ -95,7 +95,7 @@ class Generator(torch.Generator):
 
 
 def is_there(device: Any) -> bool:
-    """Whether this is the pretended GPU. Raises RuntimeError for another GPU."""
+    """True for the pretended GPU. Raises RuntimeError for another GPU."""
     wanted = torch.device(device)
     if wanted.type in ("cpu", "meta"):
         return wanted.type == "meta"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from finished_runs import FOV, HEIGHT, WHITE, WIDTH, ring, splats
+from in_process_farm import InProcess
 from PIL import Image
 from suite_records import MACHINE, record
 
@@ -22,7 +23,6 @@ from gsopt import cli
 from gsopt.benchmark.suite import definition, estimate, result_file, run_figures, run_key, runner, single_run
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
 from gsopt.data.scene import load_scene
-from gsopt.farm.job import Job, Outcome
 from gsopt.geometry import quats
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
@@ -67,24 +67,10 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ids
 
 
-class InThisProcess:
-    """A farm without processes."""
-
-    def run(self, jobs: list[Job], report: Any = None) -> Iterator[Outcome]:
-        for job in jobs:
-            try:
-                yield Outcome(job, "done", single_run.answer(job.request))
-            except RunFailed as error:
-                yield Outcome(job, "failed", error=str(error))
-
-    def cancel(self, name: str) -> None:
-        raise NotImplementedError
-
-
 def go(tmp_path: Path, context: SuiteContext, cases: list[definition.Case] = CASES) -> list[str]:
     run_key.folder_hash.cache_clear()
-    suite = definition.load("sparse")
-    return runner.run_suite(tmp_path / "r.json", suite, "c", cases, context, lambda text: None, InThisProcess())
+    suite, farm = definition.load("sparse"), InProcess(lambda request: single_run.answer(dict(request)))
+    return runner.run_suite(tmp_path / "r.json", suite, "c", cases, context, lambda text: None, farm)
 
 
 def test_nothing_is_made_twice(tmp_path: Path, context: SuiteContext, made: list[str]) -> None:

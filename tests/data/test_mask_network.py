@@ -1,4 +1,4 @@
-"""What a mask network is given, and what becomes of its answer: with a network that answers as it is told."""
+"""A mask network gets the right image and its answer becomes a mask: with a network that answers as it is told."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def objects_are_whole(folder: Path) -> None:
 
 
 def figures(folder: Path) -> Files:
-    """What a suite measured, without times and memory."""
+    """The figures of a suite, without times and memory."""
     document = json.loads((folder / "found.json").read_text()) if (folder / "found.json").exists() else {"runs": []}
     kept = ("arm", "seed", "mean", "per_view", "n_gaussians")
     return {run["scene"]: json.dumps([run[name] for name in kept]).encode() for run in document["runs"]}

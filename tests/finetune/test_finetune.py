@@ -16,7 +16,7 @@ from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import InitConfig
 from gsopt.errors import InputError, UsageError
 from gsopt.farm.local import LocalFarm
-from gsopt.finetune import evaluation, reconstruction_pairs, run
+from gsopt.finetune import evaluation, reconstruction_pairs, run, serve_pairs
 from gsopt.finetune.batches import draw_batch
 from gsopt.finetune.pair_cache import collect_pairs
 from gsopt.finetune.reconstruction_pairs import Pairs, make_pairs, render_pairs, whole_scene
@@ -37,10 +37,13 @@ SIZE = 64
 
 
 @pytest.fixture(scope="module", autouse=True)
-def short_fits() -> None:
+def short_fits() -> Iterator[None]:
     """Fits of a handful of steps, few renders to measure on: how much is learned is not what is tested."""
-    reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2
-    run.open_farm = lambda name, cpus: InProcess()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reconstruction_pairs, "STEP_COUNTS", (12,))
+        patch.setattr(evaluation, "MAX_RENDERS", 2)
+        patch.setattr(run, "open_farm", lambda name, cpus: InProcess(serve_pairs.handle))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +59,12 @@ def pairs(scenes: Path) -> Pairs:
     return make_pairs(scenes / "one", SIZE, 0, 0, make_backend("cpu", 1))
 
 
-def test_a_worker_of_a_farm_makes_the_same_pairs(scenes: Path, tmp_path: Path) -> None:
+def test_a_worker_of_a_farm_makes_the_same_pairs(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes of their own, beside the same reconstructions in this one: the same bytes, and no partial folder."""
-    out, lengths = [tmp_path / name / "pairs" for name in ("here", "there")], reconstruction_pairs.STEP_COUNTS
-    reconstruction_pairs.STEP_COUNTS = (600, 1000, 1600)  # those of a worker, which no fixture reaches
-    try:
-        for folder, farm in zip(out, (InProcess(), LocalFarm(2)), strict=True):
-            collect_pairs([scenes / "one"], 1, 32, 5, folder, farm, print)
-    finally:
-        reconstruction_pairs.STEP_COUNTS = lengths
+    monkeypatch.setattr(reconstruction_pairs, "STEP_COUNTS", (600, 1000, 1600))  # a worker's, which no fixture reaches
+    out = [tmp_path / name / "pairs" for name in ("here", "there")]
+    for folder, farm in zip(out, (InProcess(serve_pairs.handle), LocalFarm(2)), strict=True):
+        collect_pairs([scenes / "one"], 1, 32, 5, folder, farm, print)
     here, there = (sorted(path.relative_to(folder) for path in folder.rglob("*")) for folder in out)
     assert here == there
     (name,) = (path for path in here if path.suffix)

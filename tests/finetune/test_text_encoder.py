@@ -12,7 +12,7 @@ import torch
 
 from gsopt.cli import main
 from gsopt.config.guidance import GuidanceConfig
-from gsopt.finetune import captions, evaluation, reconstruction_pairs, run
+from gsopt.finetune import captions, evaluation, reconstruction_pairs, run, serve_pairs
 from gsopt.finetune.caption_tokens import encode_captions
 from gsopt.finetune.clip import make_tokenizer
 from gsopt.finetune.text_encoder import evaluate_encoder, make_encoder, scene_texts
@@ -29,9 +29,12 @@ CAPTIONS = {"one": "a red cup", "two": "a blue table", "three": "a red table"}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def short_fits() -> None:
-    reconstruction_pairs.STEP_COUNTS, evaluation.MOST = (12,), 2
-    run.open_farm = lambda name, cpus: InProcess()
+def short_fits() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reconstruction_pairs, "STEP_COUNTS", (12,))
+        patch.setattr(evaluation, "MAX_RENDERS", 2)
+        patch.setattr(run, "open_farm", lambda name, cpus: InProcess(serve_pairs.handle))
+        yield
 
 
 @pytest.fixture(scope="module")

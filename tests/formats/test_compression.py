@@ -1,4 +1,4 @@
-"""What a packed stream may cost, by its size, and how large a .glb may be."""
+"""A packed stream may cost so much by its size, and a .glb may be so large."""
 
 from __future__ import annotations
 

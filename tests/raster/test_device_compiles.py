@@ -47,7 +47,7 @@ def test_every_kernel_compiles(arch: str) -> None:
 
 @pytest.mark.parametrize("arch", ["gfx906", "gfx908", "gfx90a", "gfx1030"])
 def test_every_kernel_compiles_for_amd(arch: str) -> None:
-    """Where HIPRTC is installed: `apt-get install libamdhip64-5 libhiprtc-builtins5 rocm-device-libs` on Debian 12."""
+    """HIPRTC compiles it; on Debian 12: `apt-get install libamdhip64-5 libhiprtc-builtins5 rocm-device-libs`."""
     try:
         code = find_compiler(HIP).compile(program(), arch)
     except MissingDependency as error:
@@ -72,7 +72,7 @@ def test_a_text_that_does_not_compile_is_told_with_its_line(way: Callable[[], Co
 
 
 def test_cuda_core_is_the_second_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where no library lies beside torch, nor where the system looks for one."""
+    """No library lies beside torch, nor where the system looks for one."""
     nvrtc()
     monkeypatch.setattr(compiler, "installed", lambda dialect: [])
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)

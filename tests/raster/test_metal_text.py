@@ -38,7 +38,7 @@ def parsed(text: str, *options: str) -> TranslationUnit:
 
 
 def problems(text: str) -> list[str]:
-    """What is wrong with the text, warnings too."""
+    """The errors and warnings that clang finds in the text."""
     return [str(found) for found in parsed(text, *OPENCL, *NO_DOUBLE, "-Wall", "-Wextra", UNUSED).diagnostics]
 
 

@@ -118,7 +118,7 @@ def test_a_gpu_of_too_few_threads_is_told(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_gpu_that_computes_wrong_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What another trainer met on Apple's GPUs: gradients that are zero, without an error."""
+    """Another trainer met gradients on Apple's GPUs that are zero, without an error."""
     monkeypatch.setattr(
         mps, "metal_program", lambda: metal_program().replace("sum += scratch.sums", "sum += 0.f * scratch.sums")
     )

@@ -82,7 +82,7 @@ def test_a_step_moves_a_few_numbers(
 def test_without_a_cache_images_move(
     dataset: Path, tmp_path: Path, gpu: DeviceBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is counted is counted: images that may not stay go there in every step."""
+    """The counts are right: images that may not stay go there in every step."""
     original = Trainer.__init__
 
     def uncached(self: Trainer, plan: Any, *args: Any) -> None:
