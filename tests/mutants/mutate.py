@@ -61,8 +61,10 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60, help="number of changes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--since", default="", help="only modules that differ from this commit")
-    parser.add_argument("--json", type=Path, help="file for the outcome of every change; what it has is not done again")
-    parser.add_argument("--traces", type=Path, help="folder with the coverage and junit.xml of the tests")
+    parser.add_argument(
+        "--json", type=_absolute, help="file for the outcome of every change; what it has is not done again"
+    )
+    parser.add_argument("--traces", type=_absolute, help="folder with the coverage and junit.xml of the tests")
     parser.add_argument("--print-tests", action="store_true", help="print the folders of all tests, and end")
     options = parser.parse_args()
     if options.print_tests:
@@ -92,6 +94,11 @@ def main() -> None:
                 print(f"{mutant.file}:{mutant.line}: {change}: none of {len(tests)} tests noticed", flush=True)
     count, seconds = sum(bool(done["noticed_by"]) for done in outcomes), sum(done["seconds"] for done in outcomes)
     print(f"{count} of {len(outcomes)} noticed, of {len(possible)} possible, {seconds:.0f} s")
+
+
+def _absolute(name: str) -> Path:
+    """A path as it is here: the judge works in another folder."""
+    return Path(name).resolve()
 
 
 def resumed(path: Path | None, seed: int) -> list[dict[str, Any]]:
