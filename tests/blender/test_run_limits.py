@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import math
 import os
@@ -10,7 +11,8 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import pytest
 from job_records import record_of, wait
@@ -231,3 +233,38 @@ def test_a_new_folder_has_the_first_number_that_is_free(tmp_path: Path) -> None:
 def test_another_python_gets_utf8_and_no_buffers() -> None:
     clean = job.clean_environment({"pythonpath": "/b", "Blender_X": "1", "LD_PRELOAD": "/lib/a.so", "A": "1"})
     assert clean == {"LD_PRELOAD": "/lib/a.so", "A": "1", "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1"}
+
+
+class Kernel:
+    """A stand-in for kernel32 of Windows, where process 7 runs, 8 has ended and no other is there."""
+
+    codes: ClassVar[dict[int, int]] = {7: 259, 8: 0}
+
+    def __init__(self) -> None:
+        self.open: list[int] = []
+
+    def OpenProcess(self, access: int, inherit: bool, pid: int) -> int:
+        assert (access, inherit) == (0x1000, False)
+        self.open += [pid] if pid in self.codes else []
+        return pid if pid in self.codes else 0
+
+    def GetExitCodeProcess(self, handle: int, code: Any) -> int:
+        code._obj.value = self.codes[handle]
+        return 1
+
+    def GetProcessTimes(self, handle: int, created: Any, *others: Any) -> int:
+        if handle:
+            created._obj.value = 1000 + handle
+        return int(handle > 0 and len(others) == 3)
+
+    def CloseHandle(self, handle: int) -> int:
+        self.open = [one for one in self.open if one != handle]
+        return 1
+
+
+def test_on_windows_a_process_lives_while_it_has_no_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = Kernel()
+    monkeypatch.setattr(ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
+    assert [job._alive_on_windows(pid) for pid in (7, 8, 9)] == [True, False, False]
+    assert [job._birth_on_windows(pid) for pid in (7, 8, 9)] == ["7 1007", "8 1008", ""]
+    assert kernel.open == []

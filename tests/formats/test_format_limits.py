@@ -189,6 +189,18 @@ def test_the_json_of_a_glb_is_bounded_by_its_file(tmp_path: Path, after: int, lo
         load_splats(glb(tmp_path, longest + 1, after))
 
 
+def test_the_scene_of_a_glb_shows_its_only_mesh(tmp_path: Path) -> None:
+    """Readers that know glTF find the splats from the scene down."""
+    data = glb(tmp_path, 0).read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + length])
+    (node,) = document["scenes"][document["scene"]]["nodes"]
+    (primitive,) = document["meshes"][document["nodes"][node]["mesh"]]["primitives"]
+    assert {document["bufferViews"][row["bufferView"]]["buffer"] for row in document["accessors"]} == {0}
+    assert sorted(primitive["attributes"].values()) == list(range(len(document["accessors"])))
+    assert {view["target"] for view in document["bufferViews"]} == {34962}  # vertex attributes
+
+
 def test_numbers_of_a_glb_document_are_checked(tmp_path: Path) -> None:
     document = glb_container.Document({"a": [{}], "n": ["x"]}, 0, 0, tmp_path / "a.glb")
     assert document.integer({"k": 0}, "k") == 0

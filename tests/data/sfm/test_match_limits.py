@@ -337,3 +337,13 @@ def test_words_are_the_means_of_what_is_nearest_to_them() -> None:
         assert np.allclose(words[word], rows[nearest == word].mean(axis=0), atol=1e-4)
     assert len(retrieval._sampled(rows, 7, random)) == 7
     assert retrieval._sampled(rows, 120, random) is rows
+
+
+def test_cameras_whose_sides_are_parallel_have_the_mean_of_their_tops_for_up() -> None:
+    """Tilted up and down by different angles, all rolled by 30 degrees: their x axes fix no horizon."""
+    roll, viewmats = turn(30), np.tile(np.eye(4), (5, 1, 1))
+    for view, degrees in zip(viewmats, (-40, -10, 0, 5, 25), strict=True):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        view[:3, :3] = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ roll
+    tops = -viewmats[:, 1, :3].mean(axis=0)
+    np.testing.assert_allclose(placement.level_up(viewmats), tops / np.linalg.norm(tops), atol=1e-6)
