@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 import torch
 from ksplat_files import ksplat
-from splat_samples import make_splats
+from splat_samples import make_splats, same_bits
 
 from gsopt.errors import InputError
 from gsopt.formats import compression, glb_container, load_splats, ply_header, ply_rows, save_splats, sog, validation
+from gsopt.formats import spz as spz_format
 from gsopt.formats.compression import GzipStream
 from gsopt.formats.placement import similarity_parts
 from gsopt.formats.units import UNKNOWN, Units, units_from_comments, units_from_notes
@@ -115,6 +116,19 @@ def test_the_table_of_an_spz_stands_within_a_megabyte(tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(InputError, match="got 5 and 31"):
         load_splats(path)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_file_that_is_read_twice_is_read_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int
+) -> None:
+    """One that unpacks to much more than its size is checked to its end before a byte is kept."""
+    path = tmp_path / "a.spz"
+    pytest.importorskip("zstandard")
+    spz_format.save_spz(path, make_splats(50, degree=1), version=version)
+    once = load_splats(path)
+    monkeypatch.setattr(spz_format, "needs_check", lambda plain, packed: True)
+    assert same_bits(load_splats(path), once)
 
 
 def ply(folder: Path, header: bytes) -> Path:

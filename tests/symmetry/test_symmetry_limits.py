@@ -287,3 +287,36 @@ def test_the_radius_of_a_ball_shrinks_with_its_distance() -> None:
     expected = 0.5 * float(shown.camera.Ks[0, 0, 0]) / math.hypot(4, 1)
     assert find._projected_radius(shown, ball) == pytest.approx(expected, rel=1e-5)
     assert search.MAX_OFFSET < 1
+
+
+@pytest.mark.parametrize(
+    ("misses", "tilt", "disagreement", "believed"),
+    [
+        (0.00079, 0.0, 1.0, True),
+        (0.00081, 0.0, 1.0, False),
+        (0.00319, 0.0, 0.1, True),
+        (0.00321, 0.0, 0.1, False),
+        (0.0, 1.9, 1.0, True),
+        (0.0, 2.1, 1.0, False),
+    ],
+)
+def test_a_level_mirror_misses_by_little_and_stands_upright(
+    monkeypatch: pytest.MonkeyPatch, misses: float, tilt: float, disagreement: float, believed: bool
+) -> None:
+    """Shares of a radius of 50 px; a plane that must be that good is refined for that."""
+    a, wanted = math.radians(tilt), []
+    mirror = Mirror(torch.tensor([math.cos(a), 0, math.sin(a)]), 0.0)
+
+    def refine(candidate: Mirror, silhouettes: Any, ball: Any, most: float) -> tuple[Mirror, float]:
+        wanted.append(most)
+        return candidate, 50 * misses
+
+    monkeypatch.setattr(upright, "candidates", lambda *_: [mirror])
+    monkeypatch.setattr(upright, "refined", refine)
+    monkeypatch.setattr(upright, "_symmetry", lambda element, misses, *_: Symmetry(element, misses, disagreement))
+    nothing: Any = None
+    up = torch.tensor([0.0, 0, 1])
+    found = upright._level_mirrors([], nothing, Ball(torch.zeros(3), 1.0), blocks(), up, 50.0, 2)
+    assert len(found) == int(believed)
+    assert wanted == [pytest.approx(0.0008 * 50)]
+    assert [one.misses for one in found] == [pytest.approx(misses)] * len(found)

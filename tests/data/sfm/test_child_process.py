@@ -109,3 +109,27 @@ def test_what_a_killed_run_left_is_removed_and_that_of_a_living_one_is_kept(tmp_
         assert not dead.exists()
     assert living.exists()
     assert other.exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "answer"),
+    [
+        (InputError("x"), {"error": "InputError", "text": "x"}),
+        (ValueError("first " + "x" * 300 + "\nsecond"), {"text": f"COLMAP failed: first {'x' * 194}. Check"}),
+        (RuntimeError(), {"text": "COLMAP failed: RuntimeError. Check"}),
+        (OSError(28, "full", "a"), {"error": "OSError", "errno": 28, "text": "full", "filename": "a"}),
+        (OSError(28, "full"), {"filename": None}),
+    ],
+)
+def test_the_last_answer_of_the_child_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, answer: dict[str, Any]
+) -> None:
+    def fails(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr("gsopt.data.sfm.pipeline.write_posed_scene", fails)
+    found = child_process._done({"source": "a", "work": "b", "config": {}}, print)
+    assert "\n" not in found["text"]
+    assert found["text"].startswith(answer.get("text", ""))
+    others = {name: value for name, value in answer.items() if name != "text"}
+    assert {name: found[name] for name in others} == others

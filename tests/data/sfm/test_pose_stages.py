@@ -89,6 +89,27 @@ def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
+    ("trust", "again", "first"),
+    [(100, None, True), (99, None, False), (100, 4, True), (100, 5, False), (149, 3, True), (149, 6, False)],
+)
+def test_a_second_look_must_place_more_photos_than_a_first_one_that_can_be_trusted(
+    trust: int, again: int | None, first: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of six photos the first look has placed four."""
+    mapped, second = (None if n is None else SimpleNamespace(names=[""] * n) for n in (4, again))
+    monkeypatch.setattr(pipeline.features, "extract", lambda *_, **__: None)
+    monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
+    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True))
+    monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (second, "another graph"))
+    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
+    project: Any = ColmapProject(SimpleNamespace(), tmp_path / "database.db", tmp_path, SfmConfig())  # type: ignore[arg-type]
+    inputs: Any = SimpleNamespace(kind="none", masks=None)
+    found = run._few(project, [None] * 6, inputs, "graph", mapped)  # type: ignore[list-item, arg-type]
+    assert found == (("graph", mapped) if first else ("another graph", second))
+    assert len(run.notes) == int(not first)
+
+
+@pytest.mark.parametrize(
     ("found", "repaired"), [([], False), ([5], False), ([4], True), ([5, 3], False), ([4, 3], True), ([3, 2], True)]
 )
 def test_the_largest_of_global_reconstructions_is_repaired_where_photos_are_missing(
