@@ -7,6 +7,8 @@ import math
 import struct
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ import torch
 from dataset_builders import save_image
 from PIL import Image
 
-from gsopt.data import files, idr, images, llff, masks, numpy_files, pointcloud, posed_images, transforms
+from gsopt.data import files, idr, image_files, images, llff, masks, numpy_files, pointcloud, posed_images, transforms
 from gsopt.data.background import Background, mean_color
 from gsopt.data.depth_maps import DepthFolder
 from gsopt.data.lens import Lens
@@ -318,3 +320,12 @@ def test_images_in_order_are_images_by_name(tmp_path: Path) -> None:
     (tmp_path / "c.txt").touch()
     (tmp_path / "d.png").mkdir()
     assert [path.name for path in posed_images.images_in_order(tmp_path)] == ["a.jpg", "b.PNG"]
+
+
+def test_an_image_may_have_134_megapixels(tmp_path: Path) -> None:
+    """2^27, whatever the size of its file."""
+    with open(tmp_path / "a.png", "wb") as file:
+        file.truncate(1 << 30)
+    for width, fine in ((134_217_728, True), (134_217_729, False)):
+        image: Any = SimpleNamespace(width=width, height=1)
+        assert (image_files.bomb(image, tmp_path / "a.png") == "") == fine

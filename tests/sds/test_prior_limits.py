@@ -308,3 +308,11 @@ def test_texts_and_lists_may_be_as_long_as_the_committed_schema_says(where: str,
     assert not json_schema.is_valid(document(most + 1), COMMITTED)
     with pytest.raises(InputError):
         schema.set_from(document(most + 1))
+
+
+def test_a_word_of_one_token_is_known_to_a_tokenizer_of_whole_words() -> None:
+    tokenizer = SimpleNamespace(tokenize=lambda word: [word] if word in ("oak", "chair") else list(word))
+    tower: Any = SimpleNamespace(tokenizer=tokenizer)
+    encoder = clip.ClipEncoder("a", tower, None, None, whole_words=True)
+    assert encoder.unknown_words("Oak chair, oaken chair_2 oaken") == ["oaken"]
+    assert clip.ClipEncoder("a", tower, None, None).unknown_words("oaken") == []
