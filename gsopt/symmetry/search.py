@@ -15,7 +15,7 @@ from gsopt.geometry.voxels import Grid, dilated
 from gsopt.init.thumbnails import Thumbnail
 from gsopt.symmetry.axis import Axis, perpendicular
 from gsopt.symmetry.mirror import Mirror
-from gsopt.symmetry.silhouettes import Silhouettes
+from gsopt.symmetry.silhouettes import RayPoints, Silhouettes
 
 DIRECTIONS = 400
 """Normals tried, spread over the half sphere: about 7 degrees apart."""
@@ -38,7 +38,7 @@ LEAST_GAIN, LEAST_STEP = 0.995, 3e-4
 """It ends when a step leaves more than this share of the misses, or moves by less: radians, radii."""
 GIVE_UP_AT, GIVE_UP_ABOVE = 4, 3.0
 """It is abandoned when this many steps leave more than so many times the accepted misses."""
-_CHUNK = 32
+_CHUNK = 128
 M = TypeVar("M", Mirror, Axis)
 
 
@@ -162,19 +162,21 @@ def _uncovered_share(rows: Tensor, pixel: Tensor, stays: Bool[Tensor, "M P"]) ->
 def refined(mirror: M, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[M, float]:
     """The plane or axis moved to where the outlines miss least (Levenberg-Marquardt over what `moved` takes), and the
     root mean square of what is left, px. One that stays far from `wanted` is given up."""
-    misses, damping = silhouettes.misses(mirror), 1e-2
+    near, damping = silhouettes.near_optima(mirror), 1e-2
+    misses = silhouettes.misses(mirror, near)
     for iteration in range(MAX_STEPS):
         if iteration == GIVE_UP_AT and _rms(misses) > GIVE_UP_ABOVE * wanted:
             break
-        J = _jacobian(mirror, silhouettes, ball)
+        J = _jacobian(mirror, silhouettes, near, ball)
         A, b = J.T @ J, J.T @ misses
         step = None
         for _ in range(MAX_DAMPINGS):
             tried = -torch.linalg.solve(A + damping * torch.diag(A.diagonal() + 1e-6), b)
             moved = mirror.moved(tried, ball.center, ball.radius)
-            left = silhouettes.misses(moved)
+            ahead = silhouettes.near_optima(moved)
+            left = silhouettes.misses(moved, ahead)
             if _rms(left) < LEAST_GAIN * _rms(misses):
-                step, mirror, misses, damping = tried, moved, left, max(damping / 4, 1e-6)
+                step, mirror, near, misses, damping = tried, moved, ahead, left, max(damping / 4, 1e-6)
                 break
             damping *= 4
         if step is None or float(step.abs().max()) < LEAST_STEP:
@@ -186,10 +188,13 @@ def _rms(misses: Float[Tensor, "P"]) -> float:
     return float(misses.square().mean().sqrt())
 
 
-def _jacobian(mirror: M, silhouettes: Silhouettes, ball: Ball, step: float = 2e-3) -> Float[Tensor, "P D"]:
-    """d(misses)/d(change) by central differences."""
+def _jacobian(
+    mirror: M, silhouettes: Silhouettes, near: RayPoints, ball: Ball, step: float = 2e-3
+) -> Float[Tensor, "P D"]:
+    """d(misses)/d(change) by central differences among the points near the optima."""
     columns = []
     for change in step * torch.eye(mirror.freedom):
-        ahead, behind = (silhouettes.misses(mirror.moved(way * change, ball.center, ball.radius)) for way in (1, -1))
+        moved = (mirror.moved(way * change, ball.center, ball.radius) for way in (1, -1))
+        ahead, behind = (silhouettes.misses(each, near) for each in moved)
         columns.append((ahead - behind) / (2 * step))
     return torch.stack(columns, 1)

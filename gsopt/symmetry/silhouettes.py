@@ -65,6 +65,15 @@ class Outline:
         return sample(self.distance, finer * column, finer * row)[0]
 
 
+@dataclass(frozen=True)
+class RayPoints:
+    """Some points on each ray."""
+
+    points: Float[Tensor, "R S 3"]
+    others: Float[Tensor, "R S"]
+    """Their smallest signed distance in all photos but the ray's own, px."""
+
+
 class Silhouettes:
     """Outlines of the photos and the rays through them, for the comparison with mirrors."""
 
@@ -84,16 +93,20 @@ class Silhouettes:
         """False for opaque photos, whose alpha has no edge."""
         return len(self._origins) >= MIN_RAYS * len(self.outlines)
 
-    def misses(self, mirror: Mirror | Axis) -> Float[Tensor, "R"]:
-        """(1) for the rays of all photos, px, at most MAX_MISS."""
+    def near_optima(self, mirror: Mirror | Axis) -> RayPoints:
+        """Points around the x of (1) on the rays of all photos."""
         smallest = torch.full(self._kept.shape, -float(MAX_DISTANCE))
         smallest[self._kept] = torch.minimum(self._kept_others, self._behind(mirror, self._kept_points))
-        best, index = smallest.max(1)
         # The best point lies between two samples.
-        depth = self._depths.gather(1, index[:, None])
+        depth = self._depths.gather(1, smallest.argmax(1, keepdim=True))
         points = self._points(depth + torch.linspace(-1, 1, FINER) * (self._depths[:, 1:2] - self._depths[:, :1]))
-        around = torch.minimum(self._among_others(points, self._own[:, None]), self._behind(mirror, points))
-        return (-torch.maximum(best, around.amax(1))).clamp(0, MAX_MISS)
+        return RayPoints(points, self._among_others(points, self._own[:, None]))
+
+    def misses(self, mirror: Mirror | Axis, near: RayPoints | None = None) -> Float[Tensor, "R"]:
+        """(1) for the rays of all photos, px, at most MAX_MISS; among points near the optima of a similar mirror where
+        they are given."""
+        near = near or self.near_optima(mirror)
+        return (-torch.minimum(near.others, self._behind(mirror, near.points)).amax(1)).clamp(0, MAX_MISS)
 
     def _points(self, depths: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
         return self._origins[:, None] + self._directions[:, None] * depths[..., None]
