@@ -2,15 +2,13 @@
 
     python experiments/time_to_quality.py SCENE... --views 4 --arm default=CHECKOUT --arm early [-o FILE.json]
     python experiments/time_to_quality.py --views 4 --compare default early
-    python experiments/time_to_quality.py --ladder
 
 SCENE is a posed scene with held-out views, or a folder of them. An arm is a set of flags of `gsopt train` (ARMS), run
 with one thread in a process of its own, by the gsopt of a CHECKOUT where one is named, else by this one: arms of one
 call are paired, since how fast the machine is changes from hour to hour. A record has the held-out figures, the CPU
 seconds of the setup and of the steps, and the curve of PSNR over both at the previews; judging is not counted. Runs
 that have a record in FILE are not made again. --compare prints a row per scene: both arms' PSNR, and the CPU seconds
-after which each first reaches the first arm's final PSNR less TOLERANCE. --ladder prints the best PSNR within so many
-CPU seconds over all arms.
+after which each first reaches the first arm's final PSNR less TOLERANCE.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import subprocess
 import sys
 import tempfile
@@ -32,14 +29,22 @@ from gsopt.events import read_events, to_json, write_atomic
 from gsopt.results.evaluation import evenly_spread
 from gsopt.results.finished_run import open_run
 
+FROM_CHECKOUT = """
+import sys
+checkout = sys.argv.pop(1)
+if checkout:
+    sys.meta_path[:] = [finder for finder in sys.meta_path if "Inplace" not in type(finder).__name__]
+    sys.path.insert(0, checkout)
+from gsopt.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""An editable install finds its own modules before those of any path."""
 METRICS = ("psnr", "ssim", "lpips_alex")
 CURVE_VIEWS = 8
 PREVIEWS, PREVIEWS_ALL = 200, 500
 """Steps between two points of a curve, with few views and with all."""
 TOLERANCE = 0.1
 """dB; a run's last tenth of a dB takes a third of its time."""
-LADDER = (15, 30, 60, 180, 360, 900)
-"""CPU seconds."""
 RESULT = Path(__file__).parent / "results" / "time_to_quality.json"
 
 
@@ -75,9 +80,8 @@ def run(scene: Path, views: int | None, seed: int, arm: str, checkout: str, more
         flags += [str(PREVIEWS_ALL if views is None else PREVIEWS)]
         flags += [] if views is None else ["--views", str(views)]
         flags += [*ARMS[arm](views), *more]
-        command = [sys.executable, "-P", "-m", "gsopt", "train", str(scene), "-m", f"{folder}/run", *flags]
-        path = {"PYTHONPATH": checkout} if checkout else {}
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env={**os.environ, **path})
+        command = [sys.executable, "-c", FROM_CHECKOUT, checkout, "train", str(scene), "-m", f"{folder}/run", *flags]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         finished = open_run(Path(folder, "run"), threads=1)
         events = read_events(finished.path / "events.jsonl")[0]
         metrics = json.loads((finished.path / "metrics.json").read_text())
@@ -140,20 +144,6 @@ def comparison(runs: list[dict[str, Any]], views: int | None, arms: list[str]) -
     return "\n".join([*lines, "", said])
 
 
-def ladder(runs: list[dict[str, Any]]) -> str:
-    """A row per scene: the best PSNR of any arm's curve within so many CPU seconds."""
-    head = ["scene", *(f"{seconds} s" for seconds in LADDER)]
-    lines = ["| " + " | ".join(head) + " |", "| --- " * len(head) + "|"]
-    for name, views in sorted({(one["scene"], one["views"] or 0) for one in runs}):
-        curves = [one["curve"] for one in runs if (one["scene"], one["views"] or 0) == (name, views)]
-        cells = []
-        for limit in LADDER:
-            within = [psnr for curve in curves for _, seconds, psnr, _ in curve if seconds <= limit]
-            cells.append(f"{max(within):.2f}" if within else "")
-        lines.append("| " + " | ".join([f"{name}, {views or 'all'} views", *cells]) + " |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="*")
@@ -163,7 +153,6 @@ def main() -> None:
     parser.add_argument("--arm", action="append", default=[])
     parser.add_argument("--flags", nargs=argparse.REMAINDER, default=[], help="further flags of gsopt train; last")
     parser.add_argument("--compare", nargs=2)
-    parser.add_argument("--ladder", action="store_true")
     options = parser.parse_args()
     document = json.loads(options.o.read_text()) if options.o.exists() else {"runs": []}
     known = {(one["scene"], one["views"], one["seed"], one["arm"]) for one in document["runs"]}
@@ -175,8 +164,6 @@ def main() -> None:
                     write_atomic(options.o, to_json({**document, "machine": machine()}))
     if options.compare:
         print(comparison(document["runs"], options.views, options.compare))
-    if options.ladder:
-        print(ladder(document["runs"]))
 
 
 if __name__ == "__main__":
