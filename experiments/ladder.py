@@ -55,13 +55,15 @@ def table(runs: list[dict[str, Any]]) -> str:
         for limit in RUNGS.values():
             within = [one for one in runs if one["scene"] == name and one["seconds"] <= limit]
             best = max(within, key=lambda one: one["psnr"], default=None)
-            cells.append(
-                f"**{best['psnr']:.2f}** dB, {best['lpips_alex']:.3f} ({best['steps']:,} steps, {best['seconds']:.0f} s)"
-                if best
-                else "–"
-            )
+            cells.append("" if best is None else cell(best))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def cell(one: dict[str, Any]) -> str:
+    """What a rung of the table says of its run."""
+    cost = f"{one['steps']:,} steps, {one['seconds']:.0f} s"
+    return f"**{one['psnr']:.2f}** dB, {one['lpips_alex']:.3f} ({cost})"
 
 
 def main() -> None:
