@@ -131,7 +131,7 @@ class Slider:
 
 
 def sliding(start: float, wanted: float, misses: Any) -> tuple[Slider, float]:
-    outlines: Any = SimpleNamespace(misses=lambda slider: misses(slider.at))
+    outlines: Any = SimpleNamespace(near_optima=lambda slider: None, misses=lambda slider, near: misses(slider.at))
     found, left = refined(Slider(start), outlines, Ball(torch.zeros(3), 1.0), wanted)  # type: ignore[type-var]
     return found, left  # type: ignore[return-value]
 
