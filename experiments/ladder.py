@@ -1,4 +1,4 @@
-"""What is the best picture within 15 and 30 seconds, 1, 3, 6 and 15 minutes?
+"""Measures the best picture within 15 and 30 seconds, 1, 3, 6 and 15 minutes.
 
     python experiments/ladder.py SCENE... [--name fox] [--steps 500 1000 2000 4000 8000 16000] [--flags -r 4 --eval]
     python experiments/ladder.py --table
@@ -61,7 +61,7 @@ def table(runs: list[dict[str, Any]]) -> str:
 
 
 def cell(one: dict[str, Any]) -> str:
-    """What a rung of the table says of its run."""
+    """PSNR, LPIPS, steps and seconds of a run, for the table."""
     cost = f"{one['steps']:,} steps, {one['seconds']:.0f} s"
     return f"**{one['psnr']:.2f}** dB, {one['lpips_alex']:.3f} ({cost})"
 

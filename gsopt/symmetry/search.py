@@ -39,6 +39,7 @@ LEAST_GAIN, LEAST_STEP = 0.995, 3e-4
 GIVE_UP_AT, GIVE_UP_ABOVE = 4, 3.0
 """It is abandoned when this many steps leave more than so many times the accepted misses."""
 _CHUNK = 128
+"""Planes whose voxels are looked up at once: bounds memory."""
 M = TypeVar("M", Mirror, Axis)
 
 

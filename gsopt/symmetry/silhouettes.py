@@ -102,10 +102,9 @@ class Silhouettes:
         points = self._points(depth + torch.linspace(-1, 1, FINER) * (self._depths[:, 1:2] - self._depths[:, :1]))
         return RayPoints(points, self._among_others(points, self._own[:, None]))
 
-    def misses(self, mirror: Mirror | Axis, near: RayPoints | None = None) -> Float[Tensor, "R"]:
-        """(1) for the rays of all photos, px, at most MAX_MISS; among points near the optima of a similar mirror where
-        they are given."""
-        near = near or self.near_optima(mirror)
+    def misses(self, mirror: Mirror | Axis, near: RayPoints) -> Float[Tensor, "R"]:
+        """(1) for the rays of all photos, px, at most MAX_MISS; x is sought among points near the optima of this mirror
+        or of a similar one."""
         return (-torch.minimum(near.others, self._behind(mirror, near.points)).amax(1)).clamp(0, MAX_MISS)
 
     def _points(self, depths: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:

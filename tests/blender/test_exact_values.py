@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hamilton import POINTS, QUATERNIONS, turned
 from hypothesis import given
-from hypothesis import strategies as st
 from made_splats import random_splats
 
 from blender_addon.core import cameras, colmap, files, ply, splats, units
@@ -20,20 +20,12 @@ from blender_addon.core.errors import InputError
 from blender_addon.core.statistics import Filter, bars, outliers, summary
 
 UNIT = np.eye(4).tolist()
-SEVERAL = st.lists(st.floats(-2, 2), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
 
 
-def product(a: Any, b: Any) -> Any:
-    """Hamilton's product."""
-    return np.array([a[0] * b[0] - np.dot(a[1:], b[1:]), *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
-
-
-@given(SEVERAL, st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+@given(QUATERNIONS, POINTS)
 def test_a_quaternion_turns_a_point_as_hamiltons_product_does(quaternion: list[float], point: list[float]) -> None:
-    q, p = np.array(quaternion), np.array(point)
-    turned = product(product(q, np.array([0, *p])), q * [1, -1, -1, -1]) / np.dot(q, q)
-    matrix = colmap.rigid(q, p)
-    assert np.allclose(matrix[:3, :3] @ p, turned[1:], atol=1e-9)
+    matrix = colmap.rigid(np.array(quaternion), np.array(point))
+    assert np.allclose(matrix[:3, :3] @ point, turned(quaternion, point), atol=1e-9)
     assert matrix[:3, 3].tolist() == point
     assert matrix[3].tolist() == [0, 0, 0, 1]
 

@@ -42,8 +42,8 @@ def test_values_of_a_path_may_be_their_bounds(
 ) -> None:
     for value in fine:
         found = camera_path.read_path(path_file(tmp_path, **{name: value}))
-        read = {"fov": math.degrees(found.shots[0][1]), "fps": found.fps}
-        assert read.get(name, {found.width, found.height} - {8, 6} or {1}) in (pytest.approx(value), {value})
+        sizes = {"render_width": found.width, "render_height": found.height}
+        assert {"fov": math.degrees(found.shots[0][1]), "fps": found.fps, **sizes}[name] == pytest.approx(value)
     for value in refused:
         with pytest.raises(InputError, match=r"p\.json"):
             camera_path.read_path(path_file(tmp_path, **{name: value}))

@@ -1,4 +1,4 @@
-"""What the panel tells of a run and of a job, at the limits of what it keeps."""
+"""Limits of what the panel keeps and shows of a run and of a job."""
 
 from __future__ import annotations
 

@@ -8,27 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hamilton import POINTS, QUATERNIONS, turned
 from hypothesis import given
-from hypothesis import strategies as st
 
 from gsopt.data import colmap
 from gsopt.data.colmap_files import CAMERA_MODELS, CameraRecord
 from gsopt.data.lens import Lens
 from gsopt.errors import InputError
 
-SEVERAL = st.lists(st.floats(-2, 2), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
 
-
-def product(a: Any, b: Any) -> Any:
-    """Hamilton's product."""
-    return np.array([a[0] * b[0] - np.dot(a[1:], b[1:]), *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
-
-
-@given(SEVERAL, st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+@given(QUATERNIONS, POINTS)
 def test_a_quaternion_turns_a_point_as_hamiltons_product_does(quaternion: list[float], point: list[float]) -> None:
-    q, p = np.array(quaternion), np.array(point)
-    turned = product(product(q, np.array([0, *p])), q * [1, -1, -1, -1]) / np.dot(q, q)
-    assert np.allclose(colmap._rotation(tuple(quaternion), "a").numpy() @ p, turned[1:], atol=1e-9)  # type: ignore[arg-type]
+    w, x, y, z = quaternion
+    assert np.allclose(colmap._rotation((w, x, y, z), "a").numpy() @ point, turned(quaternion, point), atol=1e-9)
 
 
 @pytest.mark.parametrize(("norm", "fine"), [(1.01e-6, True), (0.99e-6, False), (0.99e6, True), (1.01e6, False)])

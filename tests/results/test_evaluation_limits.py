@@ -1,4 +1,4 @@
-"""What an evaluation says about itself, and the limits of what it reads and compares."""
+"""Notes of an evaluation, and the limits of what it reads and compares."""
 
 from __future__ import annotations
 

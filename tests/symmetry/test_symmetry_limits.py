@@ -137,7 +137,7 @@ def sliding(start: float, wanted: float, misses: Any) -> tuple[Slider, float]:
 
 
 def test_a_refinement_steps_as_gauss_and_newton_do_and_gives_up_what_stays_far() -> None:
-    """Of misses e^x every undamped step takes 1 from x: after four of them a hopeless plane is left alone."""
+    """Every undamped step takes 1 from the x of misses e^x: after four steps a hopeless plane is left alone."""
 
     def steep(x: float) -> Tensor:
         return torch.full((5,), math.exp(x), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What a run says about the body that it completes: shapes with their shares, words that were known, and why not."""
+"""The line of a run about the body that it completes: shapes with their shares, known words, or why none."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -60,26 +61,16 @@ def test_a_frame_is_named_by_its_number_from_one_on(tmp_path: Path) -> None:
     assert video._write(Image.new("RGB", (8, 8)), tmp_path, 41).name == "frame_00042.jpg"
 
 
-def test_frames_that_no_photo_may_have_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("size", "fine"), [((10, 10), True), ((101, 1), False)])
+def test_frames_that_no_photo_may_have_are_refused(
+    monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], fine: bool
+) -> None:
     monkeypatch.setattr(video, "MAX_PIXELS", 100)
-    for size, fine in (((10, 10), True), ((101, 1), False)):
-        frames = [Frame(*size)]
-
-        class Container:
-            streams = SimpleNamespace(video=[1])
-
-            def __enter__(self) -> Any:
-                return self
-
-            def __exit__(self, *_: object) -> None:
-                pass
-
-            def decode(self, video: int) -> Any:
-                return iter(frames)  # noqa: B023
-
-        av: Any = SimpleNamespace(open=lambda *_, **__: Container(), error=SimpleNamespace(FFmpegError=OSError))
-        if fine:
-            assert [index for index, _ in video._decoded(av, Path("a"))] == [0]
-        else:
-            with pytest.raises(InputError, match="101x1 px a frame"):
-                list(video._decoded(av, Path("a")))
+    container = SimpleNamespace(streams=SimpleNamespace(video=[1]), decode=lambda video: iter([Frame(*size)]))
+    error = SimpleNamespace(FFmpegError=OSError)
+    av: Any = SimpleNamespace(open=lambda *_, **__: nullcontext(container), error=error)
+    if fine:
+        assert [index for index, _ in video._decoded(av, Path("a"))] == [0]
+    else:
+        with pytest.raises(InputError, match="101x1 px a frame"):
+            list(video._decoded(av, Path("a")))

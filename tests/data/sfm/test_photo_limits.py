@@ -1,4 +1,4 @@
-"""What a photo is called and said to be, at the limits of its name, its zoom and its message."""
+"""Limits of a photo's name, of its zoom and of the message about it."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def test_a_second_look_must_place_more_photos_than_a_first_one_that_can_be_trusted(
     trust: int, again: int | None, first: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Of six photos the first look has placed four."""
+    """The first look has placed four of six photos."""
     mapped, second = (None if n is None else SimpleNamespace(names=[""] * n) for n in (4, again))
     monkeypatch.setattr(pipeline.features, "extract", lambda *_, **__: None)
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
