@@ -68,3 +68,13 @@ def _area_along(planes: Tensor, axis: int, size: int) -> Tensor:
         weight = (overlap / step).float().view(*[-1 if a == axis else 1 for a in range(3)])
         total += planes.index_select(axis, index.clamp(max=source - 1)) * weight
     return total
+
+
+def sample(planes: Float[Tensor, "C H W"], column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "C N"]:
+    """Bilinear values at pixel coordinates (centers at +0.5); beyond the border the border's."""
+    height, width = planes.shape[1:]
+    grid = torch.stack([column * (2 / width) - 1, row * (2 / height) - 1], dim=-1)
+    values = torch.nn.functional.grid_sample(
+        planes[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return values[0, :, 0]

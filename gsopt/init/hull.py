@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsopt.data.resample import sample
 from gsopt.data.scene import Scene
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import Focus, find_focus
@@ -24,7 +25,7 @@ from gsopt.init.inflation import inflated
 from gsopt.init.rim_colors import without_rim
 from gsopt.init.rounded_hull import rounded
 from gsopt.init.surface_colors import unoccluded_colors
-from gsopt.init.thumbnails import Thumbnail, sample, small_photos
+from gsopt.init.thumbnails import Thumbnail, small_photos
 
 SURFACE_SHARE = 0.7
 """Share of the points within a voxel of the hull's surface. The rest fill it: the hull is larger than the object, and

@@ -19,13 +19,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gsopt.data.distances import squared_distance
+from gsopt.data.resample import sample
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus, world_up
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
-from gsopt.init.distances import squared_distance
 from gsopt.init.rounded_hull import RADIUS_RATIO
-from gsopt.init.thumbnails import Thumbnail, sample
+from gsopt.init.thumbnails import Thumbnail
 
 STEEP = math.radians(50)
 """Elevation of the camera from which on the plane is level."""

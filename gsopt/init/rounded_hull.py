@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsopt.data.distances import squared_distance
 from gsopt.geometry.projection import inside, project
-from gsopt.init.distances import squared_distance
 from gsopt.init.thumbnails import Thumbnail
 
 ROUNDS = 2

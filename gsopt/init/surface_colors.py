@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsopt.data.resample import sample
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
-from gsopt.init.thumbnails import Thumbnail, colors_from_sums, sample
+from gsopt.init.thumbnails import Thumbnail, colors_from_sums
 
 _CHUNK = 1 << 16
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gsopt.data.resample import downscaled_size, premultiplied_downscale
+from gsopt.data.resample import downscaled_size, premultiplied_downscale, sample
 from gsopt.data.scene import View
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.farthest_points import farthest_points
@@ -57,16 +57,6 @@ def _small(view: View) -> Thumbnail:
     if len(planes) == 3:
         planes = torch.cat([planes, torch.full_like(planes[:1], 255)])
     return Thumbnail(view.camera.resized(width, height), planes, colored=view.color > 0)
-
-
-def sample(planes: Float[Tensor, "C H W"], column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "C N"]:
-    """Bilinear values at pixel coordinates (centers at +0.5); beyond the border the border's."""
-    height, width = planes.shape[1:]
-    grid = torch.stack([column * (2 / width) - 1, row * (2 / height) - 1], dim=-1)
-    values = torch.nn.functional.grid_sample(
-        planes[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return values[0, :, 0]
 
 
 def mean_colors(photos: list[Thumbnail], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:

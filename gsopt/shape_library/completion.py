@@ -21,10 +21,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gsopt.data.resample import sample
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
 from gsopt.init.inflation import inflated
-from gsopt.init.thumbnails import Thumbnail, sample
+from gsopt.init.thumbnails import Thumbnail
 from gsopt.shape_library.alignment import Alignments, aligned, boxed, occupancy, soft
 from gsopt.shape_library.entry import Entry
 from gsopt.shape_library.library_file import ShapeLibrary

@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsopt.data.resample import sample
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import world_up
 from gsopt.init.inflation import object_box
-from gsopt.init.thumbnails import Thumbnail, sample
+from gsopt.init.thumbnails import Thumbnail
 
 MARGIN = 1.15
 """Side of the sampled square over that of the silhouette's box."""

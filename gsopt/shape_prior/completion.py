@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsopt.data.resample import sample
 from gsopt.geometry.focus import find_focus, world_up
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
-from gsopt.init.thumbnails import Thumbnail, sample
+from gsopt.init.thumbnails import Thumbnail
 from gsopt.shape_prior.cube import Frame, Views, lookup
 from gsopt.shape_prior.diffusion import completed
 from gsopt.shape_prior.evidence import evidence

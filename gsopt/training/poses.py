@@ -24,6 +24,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry import quats, sh
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.precision import widest
+from gsopt.geometry.rigid_motion import rigid_motion
 from gsopt.raster.backend import Gradients
 
 TENSORS = ("viewmats", "whitening", "exp_avg", "exp_avg_sq", "steps")
@@ -164,20 +165,6 @@ def whitening(viewmat: Float[Tensor, "4 4"], means: Float[Tensor, "M 3"]) -> Flo
     S = torch.einsum("nic,nid->cd", J, J) / len(J)
     values, vectors = torch.linalg.eigh(S + DAMPING * torch.diag(S.diagonal()))
     return vectors @ torch.diag(values.clamp_min(1e-12).rsqrt()) @ vectors.T
-
-
-def rigid_motion(xi: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
-    """[exp(omega) tau; 0 1]: a rotation by |omega| (Rodrigues) and a shift, orthonormal to rounding."""
-    omega, tau = xi[:3], xi[3:]
-    angle = float(omega.norm())
-    w = omega.tolist()
-    cross = torch.tensor([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]], dtype=xi.dtype)
-    sine = math.sin(angle) / angle if angle > 1e-12 else 1.0
-    versine = 2 * (math.sin(angle / 2) / angle) ** 2 if angle > 1e-12 else 0.5
-    motion = torch.eye(4, dtype=xi.dtype)
-    motion[:3, :3] += sine * cross + versine * cross @ cross
-    motion[:3, 3] = tau
-    return motion
 
 
 def _centers(viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "C 3"]:

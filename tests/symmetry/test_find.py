@@ -11,13 +11,14 @@ import torch
 from balls import Ball, mirrored, ring, write_balls
 from PIL import Image
 
+from gsopt.data.outlines import MAX_DISTANCE, Outline, signed_distance
 from gsopt.data.scene import Scene, View, load_scene
 from gsopt.geometry.voxels import Grid
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.symmetry.colors import MIN_PAIRS, disagreement
 from gsopt.symmetry.find import MAX_MISSES, find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
-from gsopt.symmetry.silhouettes import MAX_DISTANCE, Outline, Silhouettes, outline_pixels, signed_distance
+from gsopt.symmetry.silhouettes import Silhouettes
 from gsopt.symmetry.symmetry import MAX_DISAGREEMENT, Symmetry
 
 HALF = [Ball((0.5, 0.1, 0.0), 0.35), Ball((0.35, 0.5, 0.3), 0.2, (40, 90, 220)), Ball((0.6, -0.4, -0.2), 0.15)]
@@ -102,7 +103,7 @@ def test_the_border_of_a_picture_is_no_outline(tmp_path: Path) -> None:
     """A ball that fills it from top to bottom has only its sides as outline."""
     scene = load_scene(write_balls(tmp_path / "ball", [Ball((0.0, 0.0, 0.0), 1.0)], ring(4, distance=3.6)))
     (photo,) = small_photos(scene.train[:1], 1)
-    column, row = outline_pixels(Outline.of(photo))
+    column, row = Outline.of(photo.camera, photo.alpha()).pixels()
     assert len(row) > 0
     assert float((column - 48).square().add((row - 48).square()).sqrt().std()) < 0.3
 
@@ -111,8 +112,8 @@ def test_points_of_an_outline_lie_on_it(tmp_path: Path) -> None:
     """To a fraction of a pixel, whichever way the outline runs."""
     scene = scene_of(tmp_path / "thing", LOPSIDED)
     for photo in small_photos(scene.train, 1):
-        outline = Outline.of(photo)
-        missed = outline.here(*outline_pixels(outline)).abs()
+        outline = Outline.of(photo.camera, photo.alpha())
+        missed = outline.here(*outline.pixels()).abs()
         assert len(missed) > 50
         assert float(missed.quantile(0.9)) < 0.1
 

@@ -11,6 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsopt.data import outlines
+from gsopt.data.outlines import MAX_DISTANCE, Outline
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.geometry.projection import inside, project
@@ -19,7 +21,6 @@ from gsopt.init.thumbnails import Thumbnail
 from gsopt.symmetry import colors, find, search, silhouettes, upright
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.search import Ball, bounding_ball, half_circle, half_sphere, joined, refined, same, uncovered
-from gsopt.symmetry.silhouettes import MAX_DISTANCE, Outline
 from gsopt.symmetry.symmetry import Symmetry
 
 
@@ -185,32 +186,36 @@ def test_the_radius_of_a_silhouette_is_half_the_diagonal_of_its_box() -> None:
 def test_a_span_reaches_a_margin_beyond_both_ends(places: list[int], margin: int, span: tuple[int, int]) -> None:
     occupied = torch.zeros(10, dtype=torch.bool)
     occupied[places] = True
-    found = silhouettes._span(occupied, margin)
+    found = outlines._span(occupied, margin)
     assert (found.start, found.stop) == span
+
+
+def outline_of(thumbnail: Thumbnail) -> Outline:
+    return Outline.of(thumbnail.camera, thumbnail.alpha())
 
 
 @pytest.mark.parametrize(("side", "finer"), [(256, 4), (257, 2)])
 def test_outlines_are_four_times_finer_up_to_1024(side: int, finer: int) -> None:
-    assert Outline.of(photo(0, side=side)).distance.shape == (1, finer * side, finer * side)
+    assert outline_of(photo(0, side=side)).distance.shape == (1, finer * side, finer * side)
 
 
 def test_what_lies_behind_a_camera_is_far_outside() -> None:
-    outline = Outline.of(photo(0))
+    outline = outline_of(photo(0))
     behind = torch.tensor([[9.0, 0, 1], [40.0, 3, 2]])
     assert outline.at(behind).tolist() == [-MAX_DISTANCE, -MAX_DISTANCE]
     assert float(outline.at(torch.zeros(1, 3))) > 0
 
 
 def test_rays_run_through_the_object_from_its_near_to_its_far_side() -> None:
-    outline = Outline.of(photo(30))
+    outline = outline_of(photo(30))
     origins, directions, depths = silhouettes._rays(outline, torch.zeros(3), 1.5)
-    camera = outline.photo.camera
+    camera = outline.camera
     distance = math.hypot(4, 1)
     assert depths[0, 0] == pytest.approx(distance - 1.5, rel=1e-5)
     assert depths[0, -1] == pytest.approx(distance + 1.5, rel=1e-5)
     points = origins + directions * depths[:, 7:8]
     column, row, depth = project(camera, points)
-    found = silhouettes.outline_pixels(outline)
+    found = outline.pixels()
     torch.testing.assert_close(column, found[0], atol=1e-3, rtol=0)
     torch.testing.assert_close(row, found[1], atol=1e-3, rtol=0)
     torch.testing.assert_close(depth, depths[:, 7], atol=1e-4, rtol=0)

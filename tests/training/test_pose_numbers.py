@@ -10,9 +10,10 @@ import torch
 from tiny_scenes import cloud, ring
 
 from gsopt.config.train import PoseConfig
+from gsopt.geometry.rigid_motion import rigid_motion
 from gsopt.raster.backend import Gradients
 from gsopt.training import poses
-from gsopt.training.poses import BETA1, BETA2, DAMPING, PoseRefinement, pose_gradient, rigid_motion, whitening
+from gsopt.training.poses import BETA1, BETA2, DAMPING, PoseRefinement, pose_gradient, whitening
 
 
 def skew(omega: torch.Tensor) -> torch.Tensor:

@@ -17,10 +17,11 @@ from gsopt.config.train import PoseConfig, SparseConfig
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.scene import load_scene
 from gsopt.errors import InputError, UsageError
+from gsopt.geometry.rigid_motion import rigid_motion
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
 from gsopt.training.loop import train
-from gsopt.training.poses import PoseRefinement, pose_gradient, rigid_motion
+from gsopt.training.poses import PoseRefinement, pose_gradient
 
 STEP = 1e-5
 """Step of the central differences; their error is about its square."""

@@ -1,4 +1,4 @@
-// Squared distances to the nearest true cell of a grid (gsopt/init/distances.py), one axis after the other
+// Squared distances to the nearest true cell of a grid (gsopt/data/distances.py), one axis after the other
 // (Felzenszwalb & Huttenlocher 2012), exact within `reach` cells along each.
 #pragma once
 #include <algorithm>

@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsopt._optional import require
+from gsopt.data.resample import sample
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.projection import inside, project
-from gsopt.init.thumbnails import Thumbnail, sample
+from gsopt.init.thumbnails import Thumbnail
 
 
 @dataclass(frozen=True)

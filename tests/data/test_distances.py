@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsopt.init.distances import FAR_SQUARED, squared_distance
+from gsopt.data.distances import FAR_SQUARED, squared_distance
 from gsopt.raster import _cpu
 from gsopt.raster.cpu_backend import ISA_VARIABLE
 
