@@ -28,6 +28,7 @@ from gsopt.data.sfm import diagnosis, features, few_photos, known_poses, mapping
 from gsopt.data.sfm.child_process import run_in_child
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
+from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes
 from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, match_joined
 from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
@@ -111,6 +112,9 @@ class _Run:
             mapped = self._mapped(project, graph, frames)
             if frames is None and self._is_few(photos):
                 graph, mapped = self._few(project, photos, inputs, graph, mapped)
+                if mapped is not None:
+                    held = held_by_silhouettes(project, mapped.reconstruction, inputs, self.work / "held", self.report)
+                    mapped = replace(mapped, reconstruction=held)
         if mapped is None:
             report = diagnosis.explain(photos, refused, graph, set())
             report.advice += self.notes

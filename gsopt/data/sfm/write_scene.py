@@ -34,11 +34,7 @@ def write_scene(
 ) -> Path:
     """Write the scene to WORK/scene and return that folder. `reconstruction` is changed to what was written."""
     reconstruction.transform(pycolmap.Sim3d(similarity.scale, _rotation(pycolmap, similarity), similarity.translation))
-    found, scene = work / "found", work / SCENE
-    _model_folder(reconstruction, found)
-    (found / "images").symlink_to(work / "photos")
-    if inputs.kind == "folder":
-        (found / "masks").symlink_to(work / "masks")
+    found, scene = found_scene(reconstruction, work / "found", inputs), work / SCENE
     (scene / "images").mkdir(parents=True)
     if undistort:
         _write_undistorted(pycolmap, reconstruction, found, scene)
@@ -47,6 +43,16 @@ def write_scene(
     export_model(reconstruction, scene, work / "again")
     write_atomic(scene / "transforms.json", to_json(transforms(read_colmap(scene).frames, similarity)))
     return scene
+
+
+def found_scene(reconstruction: Any, folder: Path, inputs: FeatureInput) -> Path:
+    """Makes `folder` a scene of the photos as they were taken, with their masks, and returns it."""
+    _model_folder(reconstruction, folder)
+    work = folder.parent
+    (folder / "images").symlink_to(work / "photos")
+    if inputs.kind == "folder":
+        (folder / "masks").symlink_to(work / "masks")
+    return folder
 
 
 def transforms(frames: Sequence[PosedImage], similarity: Similarity) -> dict[str, Any]:

@@ -1,0 +1,65 @@
+"""A reconstruction of few photos with masks, moved to where the silhouettes of the object agree."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsopt.config.train import DataConfig
+from gsopt.data.scene import load_scene
+from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm.masks import FeatureInput
+from gsopt.data.sfm.silhouettes import coherent_poses
+from gsopt.data.sfm.trajectory import compare
+from gsopt.data.sfm.write_scene import found_scene
+from gsopt.events import Report
+
+LEAST_POINTS_LEFT = 0.8
+"""Share of the points that must still fit: else silhouettes and points contradict each other, and points are kept."""
+
+
+def held_by_silhouettes(
+    project: ColmapProject, reconstruction: Any, inputs: FeatureInput, folder: Path, report: Report
+) -> Any:
+    """The reconstruction, or a copy with poses on which the silhouettes agree; `folder` is for the work."""
+    images = {reconstruction.image(number).name: number for number in reconstruction.reg_image_ids()}
+    if inputs.masks is None or images.keys() & set(inputs.unmasked):
+        return reconstruction
+    views = load_scene(DataConfig(path=str(found_scene(reconstruction, folder, inputs)), cache_mb=0)).train
+    found = coherent_poses(views)
+    if found is None:
+        return reconstruction
+    moved = copy.deepcopy(reconstruction)
+    for view, viewmat in zip(views, found.viewmats.numpy(), strict=True):
+        image = moved.image(images[view.name.removeprefix("images/")])
+        pose = project.pycolmap.Rigid3d(np.ascontiguousarray(viewmat[:3]))
+        moved.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+    fit_points(project.pycolmap, moved)
+    if moved.num_points3D() < LEAST_POINTS_LEFT * reconstruction.num_points3D():
+        return reconstruction
+    given = np.stack([view.camera.viewmats[0].double().numpy() for view in views])
+    degrees = compare(found.viewmats.numpy(), given).rotation_degrees.max()
+    report(
+        f"silhouettes moved poses by up to {degrees:.1f} degrees: outlines now miss by {found.after:.1f} px, "
+        f"{found.before:.1f} before"
+    )
+    return moved
+
+
+def fit_points(pycolmap: Any, reconstruction: Any) -> None:
+    """Moves the points to where they fit the cameras best, and leaves out those that do not fit."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    options.refine_rig_from_world = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
+    options.ceres.solver_options.num_threads = 1
+    everything = pycolmap.BundleAdjustmentConfig()
+    for number in reconstruction.reg_image_ids():
+        everything.add_image(number)
+    pycolmap.create_default_bundle_adjuster(options, everything, reconstruction).solve()
+    pycolmap.ObservationManager(reconstruction).filter_all_points3D(4.0, 1.5)
+    reconstruction.update_point_3d_errors()

@@ -1,0 +1,203 @@
+"""Laws of poses on which silhouettes agree."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from balls import Ball, ring, write_balls
+from PIL import Image
+
+from gsopt.data.scene import View, load_scene
+from gsopt.data.sfm import silhouettes
+from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes
+from gsopt.data.sfm.masks import FeatureInput
+from gsopt.data.sfm.silhouettes import COHERENT, Coherence, coherent_poses
+from gsopt.data.sfm.trajectory import compare
+from gsopt.geometry.rigid_motion import rigid_motion
+
+THING = [
+    Ball((0.0, 0.0, 0.0), 0.5),
+    Ball((0.5, 0.2, 0.3), 0.3),
+    Ball((-0.4, 0.3, -0.35), 0.25),
+    Ball((0.1, -0.55, 0.2), 0.2),
+]
+COUNT, SIZE = 8, 192
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_balls(tmp_path_factory.mktemp("thing") / "scene", THING, ring(COUNT, size=SIZE))
+
+
+@pytest.fixture(scope="module")
+def views(folder: Path) -> tuple[View, ...]:
+    return load_scene(folder).train
+
+
+def disturbed(views: tuple[View, ...], degrees: float) -> list[View]:
+    """Views whose cameras see the world turned about its origin and shifted."""
+    generator = torch.Generator().manual_seed(1)
+    moved = []
+    for view in views:
+        turn = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        shift = torch.randn(3, generator=generator, dtype=torch.float64) * 0.01
+        motion = rigid_motion(torch.cat([math.radians(degrees) * turn, torch.zeros(3, dtype=torch.float64)]))
+        viewmat = view.camera.viewmats[0].double() @ motion
+        viewmat[:3, 3] += shift
+        moved.append(replace(view, camera=replace(view.camera, viewmats=viewmat[None].float())))
+    return moved
+
+
+def viewmats(views: Any) -> np.ndarray:
+    return np.stack([view.camera.viewmats[0].double().numpy() for view in views])
+
+
+def test_disturbed_cameras_come_nearer_to_where_they_stood(views: tuple[View, ...]) -> None:
+    wrong = disturbed(views, 0.7)
+    found = coherent_poses(wrong)
+    assert found is not None
+    assert found.after < 0.3 * found.before
+    before, after = (compare(poses, viewmats(views)) for poses in (viewmats(wrong), found.viewmats.numpy()))
+    assert np.square(after.position).sum() < 0.85 * np.square(before.position).sum()
+    assert np.square(after.rotation_degrees).sum() < 0.95 * np.square(before.rotation_degrees).sum()
+
+
+def test_exact_cameras_stay(views: tuple[View, ...]) -> None:
+    assert coherent_poses(views) is None
+
+
+def test_any_number_of_threads_gives_the_same_bits(views: tuple[View, ...]) -> None:
+    wrong, before = disturbed(views, 0.5), torch.get_num_threads()
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        found.append(coherent_poses(wrong))
+    torch.set_num_threads(before)
+    assert found[0] is not None
+    assert found[1] is not None
+    assert torch.equal(found[0].viewmats, found[1].viewmats)
+
+
+def test_masks_of_another_thing_move_nothing(tmp_path: Path, views: tuple[View, ...]) -> None:
+    """Half of the photos show a larger ball beside it: no poses make these outlines agree."""
+    other = write_balls(tmp_path / "other", [Ball((0.5, 0.5, 0.4), 0.7)], ring(COUNT, size=SIZE))
+    mixed = [*views[: COUNT // 2], *load_scene(other).train[COUNT // 2 :]]
+    assert silhouettes._rms(_misses(mixed)) > COHERENT
+    assert coherent_poses(mixed) is None
+
+
+def test_photos_without_an_outline_move_nothing(views: tuple[View, ...]) -> None:
+    class Opaque:
+        def get(self, index: int) -> torch.Tensor:
+            return torch.full((SIZE, SIZE, 4), 255, dtype=torch.uint8)
+
+    wrong = disturbed(views, 0.7)
+    assert coherent_poses([replace(wrong[0], store=Opaque()), *wrong[1:]]) is None
+
+
+def test_the_derivatives_are_those_of_the_misses_among_the_same_points(views: tuple[View, ...]) -> None:
+    coherence = Coherence([silhouettes._outline(view) for view in disturbed(views, 0.7)])
+    depths = coherence.near_optima(coherence.viewmats)
+    J = coherence.jacobian(coherence.viewmats, depths, coherence.distances(coherence.viewmats, depths))
+    for column in (0, 4, 11, 25):
+        change = torch.zeros(J.shape[1], dtype=torch.float64)
+        change[column] = silhouettes.STEP
+        ahead, behind = (
+            coherence.misses(coherence.distances(coherence.moved(coherence.viewmats, way * change), depths))
+            for way in (1, -1)
+        )
+        torch.testing.assert_close(J[:, column], (ahead - behind) / (2 * silhouettes.STEP), atol=1e-6, rtol=1e-6)
+
+
+def _misses(views: Any) -> torch.Tensor:
+    coherence = Coherence([silhouettes._outline(view) for view in views])
+    return coherence.misses(coherence.distances(coherence.viewmats, coherence.near_optima(coherence.viewmats)))
+
+
+@pytest.fixture
+def work(tmp_path: Path, folder: Path) -> Path:
+    """Photos and their masks as the pipeline lays them out."""
+    (tmp_path / "photos").mkdir()
+    for path in sorted((folder / "train").iterdir()):
+        Image.open(path).save(tmp_path / "photos" / path.name)
+    return tmp_path
+
+
+def names_of(views: tuple[View, ...]) -> list[str]:
+    return [f"{Path(view.name).stem}.png" for view in views]
+
+
+def reconstruction(pycolmap: Any, truth: Any, cameras: Any, names: list[str]) -> Any:
+    """Points on the thing that every photo sees, where `truth` sees them, and cameras that may stand elsewhere."""
+    K = truth[0].camera.Ks[0].double().numpy()
+    made = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(
+        model="PINHOLE", width=SIZE, height=SIZE, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=1
+    )
+    made.add_camera_with_trivial_rig(lens)
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-0.5, 0.5, (200, 3))
+    for number, (view, camera, name) in enumerate(zip(truth, cameras, names, strict=True), start=1):
+        seen = points @ viewmats([view])[0][:3, :3].T + viewmats([view])[0][:3, 3]
+        pixels = (seen @ K.T)[:, :2] / seen[:, 2:]
+        image = pycolmap.Image(name=name, keypoints=pixels, camera_id=1, image_id=number)
+        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.ascontiguousarray(viewmats([camera])[0][:3])))
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for number in range(1, len(names) + 1):
+            track.add_element(number, row)
+        made.add_point3D(point, track, np.zeros(3, np.uint8))
+    made.update_point_3d_errors()
+    return made
+
+
+def held(work: Path, made: Any, pycolmap: Any, **changed: Any) -> tuple[Any, list[str]]:
+    said: list[str] = []
+    inputs = replace(FeatureInput(work / "photos", work / "photos", "alpha", []), **changed)
+    project: Any = SimpleNamespace(pycolmap=pycolmap)
+    return held_by_silhouettes(project, made, inputs, work / "held", said.append), said
+
+
+def test_a_reconstruction_follows_its_silhouettes_and_its_points_follow_too(
+    work: Path, views: tuple[View, ...]
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    names = names_of(views)
+    made = reconstruction(pycolmap, views, disturbed(views, 0.5), names)
+    before = made.compute_mean_reprojection_error()
+    moved, said = held(work, made, pycolmap)
+    assert moved is not made
+    assert "silhouettes moved poses" in said[0]
+    assert moved.num_points3D() > 150
+    assert moved.compute_mean_reprojection_error() < 0.6 * before
+
+
+def test_photos_without_masks_keep_their_poses(work: Path, views: tuple[View, ...]) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    names = names_of(views)
+    made = reconstruction(pycolmap, views, disturbed(views, 0.5), names)
+    assert held(work, made, pycolmap, masks=None, kind="none") == (made, [])
+    assert held(work, made, pycolmap, unmasked=[names[2]]) == (made, [])
+
+
+@pytest.mark.parametrize(("lost", "moves"), [(40, True), (41, False)])
+def test_points_that_contradict_the_silhouettes_win(
+    lost: int, moves: bool, work: Path, views: tuple[View, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fifth of 200 points may be lost where the cameras move."""
+    pycolmap = pytest.importorskip("pycolmap")
+    made = reconstruction(pycolmap, views, disturbed(views, 0.5), names_of(views))
+
+    def without(pycolmap: Any, model: Any) -> None:
+        for number in sorted(model.points3D)[:lost]:
+            model.delete_point3D(number)
+
+    monkeypatch.setattr("gsopt.data.sfm.held_by_silhouettes.fit_points", without)
+    assert (held(work, made, pycolmap)[0] is not made) == moves
