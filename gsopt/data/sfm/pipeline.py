@@ -113,8 +113,7 @@ class _Run:
             if frames is None and self._is_few(photos):
                 graph, mapped = self._few(project, photos, inputs, graph, mapped)
                 if mapped is not None:
-                    held = held_by_silhouettes(project, mapped.reconstruction, inputs, self.work / "held", self.report)
-                    mapped = replace(mapped, reconstruction=held)
+                    mapped = self._held(project, mapped, inputs)
         if mapped is None:
             report = diagnosis.explain(photos, refused, graph, set())
             report.advice += self.notes
@@ -215,6 +214,12 @@ class _Run:
             return graph, mapped
         self.notes += [diagnosis.TURNTABLE] if hypotheses.turntable else []
         return graph_again, again
+
+    def _held(self, project: ColmapProject, mapped: MappingResult, inputs: FeatureInput) -> MappingResult:
+        """With poses on which the silhouettes agree, or a note that they do not."""
+        found, notes = held_by_silhouettes(project, mapped.reconstruction, inputs, self.work / "held", self.report)
+        self.notes += notes
+        return replace(mapped, reconstruction=found)
 
     def _mapped(
         self, project: ColmapProject, graph: ViewGraph, frames: list[PosedImage] | None

@@ -63,6 +63,7 @@ def test_disturbed_cameras_come_nearer_to_where_they_stood(views: tuple[View, ..
     wrong = disturbed(views, 0.7)
     found = coherent_poses(wrong)
     assert found is not None
+    assert found.better
     assert found.after < 0.3 * found.before
     before, after = (compare(poses, viewmats(views)) for poses in (viewmats(wrong), found.viewmats.numpy()))
     assert np.square(after.position).sum() < 0.85 * np.square(before.position).sum()
@@ -70,7 +71,28 @@ def test_disturbed_cameras_come_nearer_to_where_they_stood(views: tuple[View, ..
 
 
 def test_exact_cameras_stay(views: tuple[View, ...]) -> None:
-    assert coherent_poses(views) is None
+    found = coherent_poses(views)
+    assert found is not None
+    assert not found.better
+    assert torch.equal(found.viewmats.float(), torch.cat([view.camera.viewmats for view in views]))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "better", "contradicted"),
+    [
+        (0.3, 0.1, False, False),
+        (0.31, 0.155, True, False),
+        (0.4, 0.21, False, False),
+        (3.0, 1.99, False, False),
+        (3.0, 2.0, False, True),
+        (5.0, 2.5, True, True),
+    ],
+)
+def test_poses_are_better_where_half_of_the_misses_go(
+    before: float, after: float, better: bool, contradicted: bool
+) -> None:
+    found = silhouettes.CoherentPoses(torch.eye(4)[None], before, after)
+    assert (found.better, found.contradicted) == (better, contradicted)
 
 
 def test_any_number_of_threads_gives_the_same_bits(views: tuple[View, ...]) -> None:
@@ -89,8 +111,10 @@ def test_masks_of_another_thing_move_nothing(tmp_path: Path, views: tuple[View, 
     """Half of the photos show a larger ball beside it: no poses make these outlines agree."""
     other = write_balls(tmp_path / "other", [Ball((0.5, 0.5, 0.4), 0.7)], ring(COUNT, size=SIZE))
     mixed = [*views[: COUNT // 2], *load_scene(other).train[COUNT // 2 :]]
-    assert silhouettes._rms(_misses(mixed)) > COHERENT
-    assert coherent_poses(mixed) is None
+    found = coherent_poses(mixed)
+    assert found is not None
+    assert found.before > COHERENT
+    assert not found.better
 
 
 def test_photos_without_an_outline_move_nothing(views: tuple[View, ...]) -> None:
@@ -114,11 +138,6 @@ def test_the_derivatives_are_those_of_the_misses_among_the_same_points(views: tu
             for way in (1, -1)
         )
         torch.testing.assert_close(J[:, column], (ahead - behind) / (2 * silhouettes.STEP), atol=1e-6, rtol=1e-6)
-
-
-def _misses(views: Any) -> torch.Tensor:
-    coherence = Coherence([silhouettes._outline(view) for view in views])
-    return coherence.misses(coherence.distances(coherence.viewmats, coherence.near_optima(coherence.viewmats)))
 
 
 @pytest.fixture
@@ -158,11 +177,12 @@ def reconstruction(pycolmap: Any, truth: Any, cameras: Any, names: list[str]) ->
     return made
 
 
-def held(work: Path, made: Any, pycolmap: Any, **changed: Any) -> tuple[Any, list[str]]:
+def held(work: Path, made: Any, pycolmap: Any, **changed: Any) -> tuple[Any, list[str], list[str]]:
+    """The reconstruction, the advice and the progress."""
     said: list[str] = []
     inputs = replace(FeatureInput(work / "photos", work / "photos", "alpha", []), **changed)
     project: Any = SimpleNamespace(pycolmap=pycolmap)
-    return held_by_silhouettes(project, made, inputs, work / "held", said.append), said
+    return *held_by_silhouettes(project, made, inputs, work / "held", said.append), said
 
 
 def test_a_reconstruction_follows_its_silhouettes_and_its_points_follow_too(
@@ -172,8 +192,9 @@ def test_a_reconstruction_follows_its_silhouettes_and_its_points_follow_too(
     names = names_of(views)
     made = reconstruction(pycolmap, views, disturbed(views, 0.5), names)
     before = made.compute_mean_reprojection_error()
-    moved, said = held(work, made, pycolmap)
+    moved, advice, said = held(work, made, pycolmap)
     assert moved is not made
+    assert advice == []
     assert "silhouettes moved poses" in said[0]
     assert moved.num_points3D() > 150
     assert moved.compute_mean_reprojection_error() < 0.6 * before
@@ -183,8 +204,8 @@ def test_photos_without_masks_keep_their_poses(work: Path, views: tuple[View, ..
     pycolmap = pytest.importorskip("pycolmap")
     names = names_of(views)
     made = reconstruction(pycolmap, views, disturbed(views, 0.5), names)
-    assert held(work, made, pycolmap, masks=None, kind="none") == (made, [])
-    assert held(work, made, pycolmap, unmasked=[names[2]]) == (made, [])
+    assert held(work, made, pycolmap, masks=None, kind="none") == (made, [], [])
+    assert held(work, made, pycolmap, unmasked=[names[2]]) == (made, [], [])
 
 
 @pytest.mark.parametrize(("lost", "moves"), [(40, True), (41, False)])
@@ -201,3 +222,12 @@ def test_points_that_contradict_the_silhouettes_win(
 
     monkeypatch.setattr("gsopt.data.sfm.held_by_silhouettes.fit_points", without)
     assert (held(work, made, pycolmap)[0] is not made) == moves
+
+
+def test_advice_follows_where_no_poses_near_fit_the_masks(work: Path, views: tuple[View, ...]) -> None:
+    """Half of the photos stand where others were taken from."""
+    pycolmap = pytest.importorskip("pycolmap")
+    swapped = [*views[1::2], *views[::2]]
+    found, advice, said = held(work, made := reconstruction(pycolmap, swapped, swapped, names_of(views)), pycolmap)
+    assert (found is made, said) == (True, [])
+    assert "do not fit these poses" in advice[0]
