@@ -55,12 +55,12 @@ fuzz: $(VENV)/.for-test
 	$(PY) tests/fuzz/campaign.py $(SECONDS)
 
 # Random changes of the code, COUNT of them, one at a time: does a test notice? Goes on where it was cut; remove build/mutants
-# when the code has changed.
+# when the code has changed. MODULES: files or folders, instead of all that have tests of their own.
 COUNT ?= 60
 SEED ?= 0
 MUTANTS := build/mutants
 mutants: $(MUTANTS)/junit.xml
-	$(PY) tests/mutants/mutate.py --count $(COUNT) --seed $(SEED) --traces $(MUTANTS) --json $(MUTANTS)/$(SEED).json
+	$(PY) tests/mutants/mutate.py $(MODULES) --count $(COUNT) --seed $(SEED) --traces $(MUTANTS) --json $(MUTANTS)/$(SEED).json
 
 # Which test ran which line.
 $(MUTANTS)/junit.xml: $(VENV)/.for-test

@@ -150,10 +150,12 @@ def _palette(rows: Floats) -> tuple[Floats, NDArray[np.int64]]:
     centers: list[Floats] = []
     labels = np.empty(n, np.int64)
     begin = 0
-    for group in range(int(groups.max()) + 1):
+    sizes = np.bincount(groups)
+    shares = np.maximum(1, sizes * entries // n) * (sizes > 0)
+    shares[sizes.argmax()] -= max(0, shares.sum() - entries)  # what small groups were rounded up by
+    for group, share in enumerate(shares.tolist()):
         members = np.flatnonzero(groups == group)
         if len(members):
-            share = max(1, len(members) * entries // n)
             found, labels[members] = _clusters(rows[members], share)
             labels[members] += begin
             begin += len(found)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from made_splats import random_splats
 
-from blender_addon.core import arguments, camera_path, dataset, interpreter, prompts, units
+from blender_addon.core import arguments, camera_path, cameras, dataset, interpreter, prompts, units
 from blender_addon.core.errors import InputError, UsageError
 from blender_addon.core.placement import placed
 from blender_addon.core.splats import logits
@@ -227,3 +227,12 @@ def test_the_scale_stands_in_the_first_16_kb_of_a_header(tmp_path: Path) -> None
     for before, scale in ((16_384 - 64, 0.5), (16_384, 1.0)):
         (tmp_path / "a.ply").write_bytes(b"ply\ncomment " + b"x" * before + b"\ncomment meters per unit: 0.5\n")
         assert units.meters_per_unit(tmp_path / "a.ply") == scale
+
+
+def test_a_folder_without_poses_has_no_views_and_one_that_is_absent_no_pictures(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no posed views"):
+        cameras.read_views(tmp_path)
+    assert dataset.count_png(tmp_path / "absent") == 0
+    for name in ("a.png", "b.png", "c.jpg"):
+        (tmp_path / name).touch()
+    assert dataset.count_png(tmp_path) == 2

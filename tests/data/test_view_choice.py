@@ -89,3 +89,17 @@ def test_one_view_is_taken_from_thirty_degrees_up_and_not_from_the_top() -> None
     viewmats = look_at(eyes, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1], dtype=torch.float64))
     assert telling_view(eyes, viewmats) == 2
     assert telling_view(eyes[:1], viewmats[:1]) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_the_view_that_shows_most_is_the_same_in_any_unit_of_length(scale: float) -> None:
+    """Cameras at 70, 28, -10 and 50 degrees above the object that they look at: the second is nearest to 30."""
+    up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    viewmats = []
+    for turn, degrees in enumerate((70.0, 28.0, -10.0, 50.0)):
+        a, e = torch.tensor(1.5 * turn).double(), torch.tensor(degrees).double().deg2rad()
+        eye = scale * torch.stack([a.cos() * e.cos(), a.sin() * e.cos(), e.sin()])
+        viewmats.append(look_at(eye[None], torch.zeros(3).double(), up)[0])
+    stacked = torch.stack(viewmats)
+    centers = torch.stack([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats])
+    assert telling_view(centers, stacked) == 1

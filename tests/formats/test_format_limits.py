@@ -8,6 +8,7 @@ import math
 import re
 import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -349,3 +350,19 @@ def test_names_of_columns_are_those_of_a_ply() -> None:
     others = [("means", [1]), ("sh0", [0, 2]), ("logit_opacities", []), ("quats", [3]), ("log_scales", [2])]
     found = [validation.ply_name(name, index, 15) for name, index in others]
     assert found == ["y", "f_dc_2", "opacity", "rot_3", "scale_2"]
+
+
+@pytest.mark.parametrize("version", [2, 5])
+def test_a_spz_is_written_in_versions_3_and_4_alone(tmp_path: Path, version: int) -> None:
+    with pytest.raises(InputError, match=f"must be 3 or 4, got {version}"):
+        spz_format.save_spz(tmp_path / "a.spz", make_splats(2), version=version)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN"])
+def test_rows_of_another_shape_are_refused_by_name(name: str) -> None:
+    splats = make_splats(4)
+    validation._check_shapes(splats, Path("a.ply"))
+    broken = replace(splats, **{name: getattr(splats, name)[..., None]})
+    with pytest.raises(InputError, match=f"a.ply: `{name}` must have shape"):
+        validation._check_shapes(broken, Path("a.ply"))

@@ -17,7 +17,7 @@ from splat_laws import require_short
 from splat_samples import make_splats
 
 from gsopt.errors import InputError
-from gsopt.formats import is_antialiased, load_splats, save_splats
+from gsopt.formats import is_antialiased, load_splats, save_splats, sog_codes
 
 Members = dict[str, bytes]
 
@@ -101,6 +101,23 @@ def test_equal_splats_give_one_palette_entry_each(tmp_path: Path) -> None:
     back = load_splats(tmp_path / "a.sog")
     nearest = (back.means[:, None] - few.means[None]).norm(dim=2).argmin(dim=1)
     assert float((back.shN - few.shN[nearest]).abs().max()) <= 1.8 / 256
+
+
+def test_an_entry_of_the_palette_has_a_number_of_two_bytes_however_many_splats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A million splats, of which five stand apart in groups of one: each of these takes a whole entry."""
+    apart, n = 5, 1 << 20
+    rows = np.zeros((n, 1), np.float32)
+    rows[:apart, 0] = np.arange(1, apart + 1)
+
+    def clusters(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """As many centers as asked for; the first call makes the groups."""
+        labels = rows[:, 0].astype(np.int64) if len(rows) == n else np.arange(len(rows)) % count
+        return np.zeros((count, 1), np.float32), labels
+
+    monkeypatch.setattr(sog_codes, "_clusters", clusters)
+    palette, labels = sog_codes._palette(rows)
+    assert len(palette) == 1 << 16
+    assert sorted(set(labels.tolist())) == list(range(1 << 16))
 
 
 CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {

@@ -37,8 +37,8 @@ TESTS = {
     "blender_addon/core": "tests/blender",
 }
 """Modules, and the tests that mirror them: what a line needs that no test is known to run."""
-ALSO_RUN = "tests/config tests/fuzz"
-"""Tests of other folders that are quick and run these modules."""
+ALSO_RUN = "tests/config tests/fuzz tests/cli tests/finetune"
+"""Tests of other folders that run these modules: a prior is trained on views, a command starts a run."""
 
 
 def changed_since(commit: str) -> list[Path]:

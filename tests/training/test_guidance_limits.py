@@ -16,7 +16,9 @@ from tiny_scenes import ring
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError, NumericalError, UsageError
+from gsopt.sds.prompts import Prompt
 from gsopt.training.guided import guard, references
+from gsopt.training.guided.compare_prompts import Arm, compare_prompts
 from gsopt.training.guided.session import RunGuidance, report_counts
 
 
@@ -208,3 +210,17 @@ def test_a_left_out_view_takes_its_mirror_images_along() -> None:
     assert left_out.view is views[1]
     assert [view.index for view in left_out.scene.train] == [0, 2]
     assert [image.index for image in left_out.scene.mirrored] == [0, 2, 0, 2]
+
+
+def test_prompts_are_compared_from_two_views_on_and_with_a_prior_that_takes_words() -> None:
+    """A prior without words and arms without prompts get past both: the next thing that is asked for is the scene."""
+    mute: Any = SimpleNamespace(name="mute", encoder=lambda: None, aligned=False)
+    words, none = Arm("words", (Prompt("a chair", source="user"),)), Arm("none", ())
+    given: Any = {count: SimpleNamespace(train=[None] * count) for count in (1, 2)}
+    nothing: Any = None
+    with pytest.raises(UsageError, match="at least 2 input views, got 1"):
+        compare_prompts(TrainConfig(), given[1], nothing, mute, [none], print)
+    with pytest.raises(UsageError, match="The prior mute takes no words"):
+        compare_prompts(TrainConfig(), given[2], nothing, mute, [none, words], print)
+    with pytest.raises(AttributeError):
+        compare_prompts(TrainConfig(), given[2], nothing, mute, [none], print)

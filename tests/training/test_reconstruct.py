@@ -131,6 +131,23 @@ def test_a_finished_run_is_refused_and_resumed_from_its_folder_alone(data: Path,
     assert again.metrics["mean"] == first.metrics["mean"]
 
 
+def test_the_folder_of_another_run_is_refused_before_poses_are_sought(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sought: list[Path] = []
+    monkeypatch.setattr("gsopt.training.reconstruct.posed_scene", lambda source, *_: sought.append(source) or data)
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (200, 200)).save(tmp_path / "photos" / "one.jpg")
+    gsopt.reconstruct(tmp_path / "photos", tmp_path / "first", **SHORT)
+    assert sought == [tmp_path / "photos"]
+    (tmp_path / "run").mkdir()
+    shutil.copy(tmp_path / "first" / "splat.ply", tmp_path / "run")
+    with pytest.raises(UsageError, match="holds another run"):
+        gsopt.reconstruct(tmp_path / "photos", tmp_path / "run", **SHORT)
+    assert len(sought) == 1
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["splat.ply"]
+
+
 @pytest.mark.parametrize(
     ("settings", "error", "text"),
     [

@@ -355,3 +355,17 @@ def test_the_share_of_a_window_is_that_of_its_pixels() -> None:
     target = Target(ring(1, 1.0)[0], colors, None, (6, 8))
     assert target.share == 0.25
     assert list(target.images) == ["colors"]
+
+
+def test_work_without_settings_is_not_resumed(tmp_path: Path) -> None:
+    """An empty folder may be: the run begins there."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "splat.ply").touch()
+    with (
+        pytest.raises(InputError, match=r"has no config\.json, so it cannot be resumed"),
+        run_directory.opened(tmp_path / "run", TrainConfig(), True, None),
+    ):
+        pass
+    assert not (tmp_path / "run" / "config.json").exists()
+    with run_directory.opened(tmp_path / "empty", TrainConfig(), True, None):
+        assert (tmp_path / "empty" / "config.json").is_file()

@@ -133,3 +133,21 @@ def test_the_last_answer_of_the_child_is_one_line(
     assert found["text"].startswith(answer.get("text", ""))
     others = {name: value for name, value in answer.items() if name != "text"}
     assert {name: found[name] for name in others} == others
+
+
+def test_the_child_imports_the_package_of_its_parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever else is installed: the first folder of its path holds this gsopt, and what was on the path stays."""
+    asked: list[dict[str, str]] = []
+
+    def started(command: list[str], env: dict[str, str], **_: Any) -> None:
+        asked.append(env)
+        raise InputError("Asked for a child. Nothing else is wanted.")
+
+    monkeypatch.setattr(child_process.subprocess, "Popen", started)
+    for others in ("", f"{tmp_path}{os.pathsep}elsewhere"):
+        monkeypatch.setenv("PYTHONPATH", others)
+        with pytest.raises(InputError, match="Asked for a child"):
+            child_process.run_in_child(tmp_path, tmp_path, SfmConfig(), print)
+        first, *rest = asked[-1]["PYTHONPATH"].split(os.pathsep)
+        assert Path(first, *child_process.__name__.split(".")).with_suffix(".py").samefile(child_process.__file__)
+        assert rest == list(filter(None, others.split(os.pathsep)))
