@@ -74,8 +74,7 @@ class CoherentPoses:
 
 
 def coherent_poses(views: Sequence[View]) -> CoherentPoses | None:
-    """The poses of views with alpha on which the silhouettes agree most, or None where a photo has no
-    outline."""
+    """Poses of views with alpha on which the silhouettes agree most, or None if a photo has no outline."""
     outlines = [_outline(view) for view in views]
     if any(len(outline.pixels()[0]) < MIN_PIXELS for outline in outlines):
         return None
