@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import textured_room as room
 import torch
 from balls import Ball, ring, write_balls
 from PIL import Image
 
 from gsopt.data.scene import View, load_scene
-from gsopt.data.sfm import silhouettes
+from gsopt.data.sfm import pipeline, silhouettes
 from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes
 from gsopt.data.sfm.masks import FeatureInput
+from gsopt.data.sfm.photos import find_photos
 from gsopt.data.sfm.silhouettes import COHERENT, Coherence, coherent_poses
 from gsopt.data.sfm.trajectory import compare
 from gsopt.geometry.rigid_motion import rigid_motion
@@ -231,3 +233,23 @@ def test_advice_follows_where_no_poses_near_fit_the_masks(work: Path, views: tup
     found, advice, said = held(work, made := reconstruction(pycolmap, swapped, swapped, names_of(views)), pycolmap)
     assert (found is made, said) == (True, [])
     assert "do not fit these poses" in advice[0]
+
+
+def test_few_photos_are_held_by_their_masks(room_photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The note of a contradiction is advice in the diagnosis."""
+    seen: list[FeatureInput] = []
+
+    def contradicted(project: Any, made: Any, inputs: FeatureInput, folder: Path, report: Any) -> tuple[Any, list[str]]:
+        seen.append(inputs)
+        return made, ["They do not fit."]
+
+    monkeypatch.setattr(pipeline, "held_by_silhouettes", contradicted)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for photo in find_photos(room_photos):
+        Image.new("L", Image.open(photo).size, 255).save(masks / f"{photo.stem}.png")
+    (tmp_path / "work").mkdir()
+    config = replace(room.QUICK, masks=str(masks))
+    diagnosis, _ = pipeline.write_posed_scene(room_photos, tmp_path / "work", config, lambda line: None)
+    assert [inputs.kind for inputs in seen] == ["folder"]
+    assert diagnosis.advice[0] == "They do not fit."
