@@ -35,8 +35,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--train", default="-r 4 --threads 1", help="more words for `gsopt train`")
     args = parser.parse_args()
-    names = [view.name for view in load_scene(args.scene).train]
-    found = coherent_poses(load_scene(args.scene).train)
+    views = load_scene(args.scene).train
+    names = [view.name for view in views]
+    found = coherent_poses(views)
     assert found is not None
     moved = dict(zip(names, opengl_from_viewmats(found.viewmats).tolist(), strict=True))
     rows = []

@@ -11,6 +11,7 @@ import numpy as np
 from gsopt.config.train import DataConfig
 from gsopt.data.scene import load_scene
 from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm.mapping import bundle_adjusted
 from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.silhouettes import coherent_poses
 from gsopt.data.sfm.trajectory import compare
@@ -18,9 +19,9 @@ from gsopt.data.sfm.write_scene import found_scene
 from gsopt.events import Report
 
 CONTRADICTION = (
-    "The outlines in the masks do not fit these poses: they miss each other by {:.0f} px of 512. Some poses or some "
-    "masks are wrong, whatever the points say. Look at the cameras in the picture and at the masks, and take photos "
-    "closer to each other."
+    "The outlines in the masks do not fit these poses: they miss each other by {:.0f} px (masks of up to 512). Some "
+    "poses or some masks are wrong, whatever the points say. Look at the cameras in the picture and at the masks, and "
+    "take photos closer to each other."
 )
 LEAST_POINTS_LEFT = 0.8
 """Share of the points that must still fit: else silhouettes and points contradict each other, and points are kept."""
@@ -45,7 +46,7 @@ def held_by_silhouettes(
         image = moved.image(images[view.name.removeprefix("images/")])
         pose = project.pycolmap.Rigid3d(np.ascontiguousarray(viewmat[:3]))
         moved.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
-    fit_points(project.pycolmap, moved)
+    moved = bundle_adjusted(project, moved, lens=False, poses=False)
     if moved.num_points3D() < LEAST_POINTS_LEFT * reconstruction.num_points3D():
         return reconstruction, []
     given = np.stack([view.camera.viewmats[0].double().numpy() for view in views])
@@ -55,19 +56,3 @@ def held_by_silhouettes(
         f"{found.before:.1f} before"
     )
     return moved, []
-
-
-def fit_points(pycolmap: Any, reconstruction: Any) -> None:
-    """Moves the points to where they fit the cameras best, and leaves out those that do not fit."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
-    options.refine_rig_from_world = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
-    options.ceres.solver_options.num_threads = 1
-    everything = pycolmap.BundleAdjustmentConfig()
-    for number in reconstruction.reg_image_ids():
-        everything.add_image(number)
-    pycolmap.create_default_bundle_adjuster(options, everything, reconstruction).solve()
-    pycolmap.ObservationManager(reconstruction).filter_all_points3D(4.0, 1.5)
-    reconstruction.update_point_3d_errors()

@@ -119,13 +119,17 @@ def off_center(camera: Any) -> float:
     return float(max(abs(x - 0.5), abs(y - 0.5)))
 
 
-def bundle_adjusted(project: ColmapProject, reconstruction: Any, *, center: bool = False, lens: bool = True) -> Any:
-    """A copy after bundle adjustment; `center` moves principal points, `lens` the terms of distortion."""
+def bundle_adjusted(
+    project: ColmapProject, reconstruction: Any, *, center: bool = False, lens: bool = True, poses: bool = True
+) -> Any:
+    """A copy after bundle adjustment; `center` moves principal points, `lens` the terms of distortion. Without `poses`
+    cameras keep their poses and focal lengths."""
     pycolmap = project.pycolmap
     reconstruction = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = project.config.focal is None
+    options.refine_rig_from_world = poses
+    options.refine_focal_length = poses and project.config.focal is None
     options.refine_principal_point = center
     options.refine_extra_params = lens
     options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
@@ -133,7 +137,8 @@ def bundle_adjusted(project: ColmapProject, reconstruction: Any, *, center: bool
     everything = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():
         everything.add_image(image_id)
-    everything.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if poses:
+        everything.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, everything, reconstruction).solve()
     pycolmap.ObservationManager(reconstruction).filter_all_points3D(4.0, 1.5)
     reconstruction.update_point_3d_errors()

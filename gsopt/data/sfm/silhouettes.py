@@ -108,7 +108,7 @@ class Coherence:
         middle = (viewmats[:, 2, :3] @ self.center + viewmats[:, 2, 3])[self._own]
         reach = torch.linspace(-1, 1, SAMPLES, dtype=torch.float64) * REACH * self.radius
         depths = (middle[:, None] + reach).clamp(min=1e-3 * self.radius)
-        best = self._smallest(self.distances(viewmats, depths)).argmax(1, keepdim=True)
+        best = self.distances(viewmats, depths).amin(0).argmax(1, keepdim=True)
         return depths.gather(1, best) + torch.linspace(-1, 1, FINER, dtype=torch.float64) * (reach[1] - reach[0])
 
     def distances(self, viewmats: Float[Tensor, "C 4 4"], depths: Float[Tensor, "R S"]) -> Float[Tensor, "C R S"]:
@@ -120,7 +120,7 @@ class Coherence:
 
     def misses(self, distances: Float[Tensor, "C R S"]) -> Float[Tensor, "R"]:
         """(1) for all rays, px."""
-        return (-self._smallest(distances).amax(1)).clamp(min=0)
+        return (-distances.amin(0).amax(1)).clamp(min=0)
 
     def jacobian(
         self, viewmats: Float[Tensor, "C 4 4"], depths: Float[Tensor, "R S"], distances: Float[Tensor, "C R S"]
@@ -181,10 +181,6 @@ class Coherence:
         column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
         found = self.outlines[view].here(column.float(), row.float()).double()
         return torch.where(before, found, -float(MAX_DISTANCE)).view(points.shape[:2])
-
-    @staticmethod
-    def _smallest(distances: Float[Tensor, "C R S"]) -> Float[Tensor, "R S"]:
-        return distances.amin(0)
 
 
 def _directions(outline: Outline, column: Tensor, row: Tensor) -> Float[Tensor, "R 3"]:

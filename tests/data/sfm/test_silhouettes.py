@@ -199,6 +199,11 @@ def test_a_reconstruction_follows_its_silhouettes_and_its_points_follow_too(
     assert advice == []
     assert "silhouettes moved poses" in said[0]
     assert moved.num_points3D() > 150
+    poses = {moved.image(number).name: moved.image(number).cam_from_world().matrix() for number in range(1, COUNT + 1)}
+    coherent = coherent_poses(disturbed(views, 0.5))
+    assert coherent is not None
+    for name, viewmat in zip(names, coherent.viewmats.numpy(), strict=True):
+        np.testing.assert_allclose(poses[name], viewmat[:3], atol=2e-3)
     assert moved.compute_mean_reprojection_error() < 0.6 * before
 
 
@@ -218,11 +223,13 @@ def test_points_that_contradict_the_silhouettes_win(
     pycolmap = pytest.importorskip("pycolmap")
     made = reconstruction(pycolmap, views, disturbed(views, 0.5), names_of(views))
 
-    def without(pycolmap: Any, model: Any) -> None:
+    def without(project: Any, model: Any, *, lens: bool, poses: bool) -> Any:
+        assert (lens, poses) == (False, False)
         for number in sorted(model.points3D)[:lost]:
             model.delete_point3D(number)
+        return model
 
-    monkeypatch.setattr("gsopt.data.sfm.held_by_silhouettes.fit_points", without)
+    monkeypatch.setattr("gsopt.data.sfm.held_by_silhouettes.bundle_adjusted", without)
     assert (held(work, made, pycolmap)[0] is not made) == moves
 
 
