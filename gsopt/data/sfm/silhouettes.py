@@ -82,6 +82,24 @@ def coherent_poses(views: Sequence[View]) -> CoherentPoses | None:
         return _refined(Coherence(outlines))
 
 
+def contradicting(views: Sequence[View]) -> list[int]:
+    """Numbers of the few views whose outlines contradict those of all others, which agree; none where it is not so.
+
+    Views are left out one by one, always the one without which the others miss least, down to more than half of them.
+    """
+    with one_torch_thread():
+        coherence = Coherence([_outline(view) for view in views])
+        distances = coherence.distances(coherence.viewmats, coherence.across(coherence.viewmats))
+        agreeing = list(range(len(views)))
+        enough = min(CONTRADICTED, MOST_MISSES_LEFT * coherence.misses_among(agreeing, distances))
+        while len(agreeing) - 1 > len(views) / 2:
+            rests = [[view for view in agreeing if view != left_out] for left_out in agreeing]
+            left, agreeing = min((coherence.misses_among(rest, distances), rest) for rest in rests)
+            if left <= enough:
+                return sorted(set(range(len(views))) - set(agreeing))
+    return []
+
+
 def _outline(view: View) -> Outline:
     """A photo's silhouette at a bounded size."""
     pixels = view.pixels()
@@ -103,13 +121,18 @@ class Coherence:
         self._directions = torch.cat([_directions(o, *p) for o, p in zip(outlines, pixels, strict=True)])
         self.center, self.radius = _ball(self.viewmats, self._own, self._directions)
 
-    def near_optima(self, viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "R S"]:
-        """Depths around the x of (1) on all rays."""
+    def across(self, viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "R S"]:
+        """Depths all through the object on all rays."""
         middle = (viewmats[:, 2, :3] @ self.center + viewmats[:, 2, 3])[self._own]
         reach = torch.linspace(-1, 1, SAMPLES, dtype=torch.float64) * REACH * self.radius
-        depths = (middle[:, None] + reach).clamp(min=1e-3 * self.radius)
+        return (middle[:, None] + reach).clamp(min=1e-3 * self.radius)
+
+    def near_optima(self, viewmats: Float[Tensor, "C 4 4"]) -> Float[Tensor, "R S"]:
+        """Depths around the x of (1) on all rays."""
+        depths = self.across(viewmats)
         best = self.distances(viewmats, depths).amin(0).argmax(1, keepdim=True)
-        return depths.gather(1, best) + torch.linspace(-1, 1, FINER, dtype=torch.float64) * (reach[1] - reach[0])
+        apart = 2 * REACH * self.radius / (SAMPLES - 1)
+        return depths.gather(1, best) + torch.linspace(-1, 1, FINER, dtype=torch.float64) * apart
 
     def distances(self, viewmats: Float[Tensor, "C 4 4"], depths: Float[Tensor, "R S"]) -> Float[Tensor, "C R S"]:
         """Signed distances of points on all rays in all photos; far inside in the ray's own."""
@@ -121,6 +144,11 @@ class Coherence:
     def misses(self, distances: Float[Tensor, "C R S"]) -> Float[Tensor, "R"]:
         """(1) for all rays, px."""
         return (-distances.amin(0).amax(1)).clamp(min=0)
+
+    def misses_among(self, chosen: list[int], distances: Float[Tensor, "C R S"]) -> float:
+        """Root mean square of (1) without the other views, px."""
+        rays = torch.isin(self._own, torch.tensor(chosen))
+        return _rms(self.misses(distances[chosen][:, rays]))
 
     def jacobian(
         self, viewmats: Float[Tensor, "C 4 4"], depths: Float[Tensor, "R S"], distances: Float[Tensor, "C R S"]

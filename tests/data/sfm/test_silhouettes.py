@@ -17,10 +17,12 @@ from PIL import Image
 
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm import pipeline, silhouettes
-from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes
+from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes, loosely_held
+from gsopt.data.sfm.mapping import registered
 from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.photos import find_photos
-from gsopt.data.sfm.silhouettes import COHERENT, Coherence, coherent_poses
+from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.silhouettes import COHERENT, Coherence, coherent_poses, contradicting
 from gsopt.data.sfm.trajectory import compare
 from gsopt.geometry.rigid_motion import rigid_motion
 
@@ -183,7 +185,7 @@ def held(work: Path, made: Any, pycolmap: Any, **changed: Any) -> tuple[Any, lis
     """The reconstruction, the advice and the progress."""
     said: list[str] = []
     inputs = replace(FeatureInput(work / "photos", work / "photos", "alpha", []), **changed)
-    project: Any = SimpleNamespace(pycolmap=pycolmap)
+    project: Any = SimpleNamespace(pycolmap=pycolmap, config=SfmConfig())
     return *held_by_silhouettes(project, made, inputs, work / "held", said.append), said
 
 
@@ -240,6 +242,71 @@ def test_advice_follows_where_no_poses_near_fit_the_masks(work: Path, views: tup
     found, advice, said = held(work, made := reconstruction(pycolmap, swapped, swapped, names_of(views)), pycolmap)
     assert (found is made, said) == (True, [])
     assert "do not fit these poses" in advice[0]
+
+
+def misplaced(views: tuple[View, ...], wrong: tuple[int, ...]) -> list[View]:
+    """Some photos stand a quarter of the ring from where they were taken."""
+    cameras = [views[(row + 2) % COUNT if row in wrong else row].camera for row in range(COUNT)]
+    return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
+
+
+@pytest.mark.parametrize("wrong", [(1,), (0, 3), (1, 4, 6)])
+def test_the_photos_whose_outlines_contradict_the_others_are_named(
+    wrong: tuple[int, ...], views: tuple[View, ...]
+) -> None:
+    assert contradicting(misplaced(views, wrong)) == list(wrong)
+
+
+def test_nobody_is_named_where_half_contradicts_half(views: tuple[View, ...]) -> None:
+    assert contradicting(misplaced(views, (0, 2, 4, 6))) == []
+
+
+def with_points_seen(made: Any, number: int, share: float) -> Any:
+    """The reconstruction after a photo has lost sight of most points."""
+    for point_id in sorted(made.points3D)[int(share * made.num_points3D()) :]:
+        row = next(
+            element.point2D_idx for element in made.point3D(point_id).track.elements if element.image_id == number
+        )
+        made.delete_observation(number, row)
+    return made
+
+
+@pytest.mark.parametrize(("share", "loose"), [(0.245, True), (0.25, False)])
+def test_less_than_a_quarter_of_the_usual_points_hold_loosely(
+    share: float, loose: bool, views: tuple[View, ...]
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    made = with_points_seen(reconstruction(pycolmap, views, views, names_of(views)), 3, share)
+    assert loosely_held(made, {3}) == loose
+    assert not loosely_held(made, {3, 4})
+
+
+def test_a_photo_with_a_wrong_outline_and_few_points_is_left_out(work: Path, views: tuple[View, ...]) -> None:
+    """The others are then held by their silhouettes as ever."""
+    pycolmap = pytest.importorskip("pycolmap")
+    names = names_of(views)
+    wrong = misplaced(views, (2,))
+    made = with_points_seen(reconstruction(pycolmap, wrong, wrong, names), 3, 0.1)
+    found, advice, _ = held(work, made, pycolmap)
+    assert registered(found) == set(names) - {names[2]}
+    assert registered(made) == set(names)
+    assert len(advice) == 1
+    assert f"Left out: {names[2]}. " in advice[0]
+    right = [view for row, view in enumerate(views) if row != 2]
+    poses = {
+        found.image(number).name: found.image(number).cam_from_world().matrix() for number in found.reg_image_ids()
+    }
+    poses_of_others = np.stack([np.vstack([poses[f"{Path(view.name).stem}.png"], [0, 0, 0, 1]]) for view in right])
+    assert compare(poses_of_others, viewmats(right)).rotation_degrees.max() < 0.2
+
+
+def test_a_photo_with_a_wrong_outline_and_many_points_is_named(work: Path, views: tuple[View, ...]) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    wrong = misplaced(views, (2,))
+    made = reconstruction(pycolmap, wrong, wrong, names_of(views))
+    found, advice, said = held(work, made, pycolmap)
+    assert (found is made, said) == (True, [])
+    assert f"The outlines in the masks of {names_of(views)[2]} contradict" in advice[0]
 
 
 def test_few_photos_are_held_by_their_masks(room_photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
