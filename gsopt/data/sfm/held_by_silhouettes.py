@@ -13,6 +13,7 @@ import numpy as np
 from gsopt.config.train import DataConfig
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm.few_photos import AMPLE_OBSERVATIONS, observations
 from gsopt.data.sfm.mapping import bundle_adjusted
 from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.silhouettes import CoherentPoses, coherent_poses, contradicting
@@ -22,8 +23,8 @@ from gsopt.events import Report
 
 CONTRADICTION = (
     "The outlines in the masks do not fit these poses: they miss each other by {:.0f} px (masks of up to 512). Some "
-    "poses or some masks are wrong, whatever the points say. Look at the cameras in the picture and at the masks, and "
-    "take photos closer to each other."
+    "poses or some masks are wrong, whatever the points say. Look at the masks, or give `--masks none`; take photos "
+    "closer to each other."
 )
 LEFT_OUT = (
     "Left out: {}. The outlines contradict those of all other photos, which agree, and few points hold these poses: "
@@ -42,9 +43,10 @@ LEAST_POINTS_LEFT = 0.8
 
 def held_by_silhouettes(
     project: ColmapProject, reconstruction: Any, inputs: FeatureInput, folder: Path, report: Report
-) -> tuple[Any, list[str]]:
+) -> tuple[Any | None, list[str]]:
     """The reconstruction, or a copy with poses on which the silhouettes agree, and advice where nothing near makes them
     agree; `folder` is for the work. A copy lacks photos whose outlines contradict all others and that few points hold.
+    None where few points hold all photos and no outlines agree.
     """
     images = {reconstruction.image(number).name: number for number in reconstruction.reg_image_ids()}
     if inputs.masks is None or images.keys() & set(inputs.unmasked):
@@ -56,7 +58,8 @@ def held_by_silhouettes(
     if found.contradicted:
         wrong = [_name(views[number]) for number in contradicting(views)]
         if not wrong:
-            return reconstruction, [CONTRADICTION.format(found.before)]
+            believed = reconstruction if observations(reconstruction) >= AMPLE_OBSERVATIONS else None
+            return believed, [CONTRADICTION.format(found.before)]
         if not loosely_held(reconstruction, {images[name] for name in wrong}):
             return reconstruction, [WRONG_MASKS.format(" and ".join(wrong))]
         left = _without(project, reconstruction, {images[name] for name in wrong})

@@ -215,11 +215,11 @@ class _Run:
         self.notes += [diagnosis.TURNTABLE] if hypotheses.turntable else []
         return graph_again, again
 
-    def _held(self, project: ColmapProject, mapped: MappingResult, inputs: FeatureInput) -> MappingResult:
-        """With poses on which the silhouettes agree, or a note that they do not."""
+    def _held(self, project: ColmapProject, mapped: MappingResult, inputs: FeatureInput) -> MappingResult | None:
+        """With poses on which silhouettes agree, or a note that they do not; None if nothing speaks for the poses."""
         found, notes = held_by_silhouettes(project, mapped.reconstruction, inputs, self.work / "held", self.report)
         self.notes += notes
-        return replace(mapped, reconstruction=found)
+        return replace(mapped, reconstruction=found) if found is not None else None
 
     def _mapped(
         self, project: ColmapProject, graph: ViewGraph, frames: list[PosedImage] | None

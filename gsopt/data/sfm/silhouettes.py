@@ -48,6 +48,8 @@ photos of a toy by up to 180 degrees, its mean error 0.8 px; 1.4 with the publis
 MAX_STEPS, MAX_DAMPINGS, LEAST_GAIN, STEP = 25, 5, 1e-3, 2e-3
 """Steps, dampings tried for each, the share of the cost below which a gain ends the search, and the step of the
 derivatives."""
+FEWEST_AGREEING = 3
+"""Views of which outlines can agree by more than chance."""
 MIN_PIXELS = 20
 """Outline pixels that every photo needs."""
 FREEDOM = 6
@@ -85,14 +87,14 @@ def coherent_poses(views: Sequence[View]) -> CoherentPoses | None:
 def contradicting(views: Sequence[View]) -> list[int]:
     """Numbers of the few views whose outlines contradict those of all others, which agree; none where it is not so.
 
-    Views are left out one by one, always the one without which the others miss least, down to more than half of them.
+    Views are left out one by one, always the one without which the others miss least, as long as more than half stay.
     """
     with one_torch_thread():
         coherence = Coherence([_outline(view) for view in views])
         distances = coherence.distances(coherence.viewmats, coherence.across(coherence.viewmats))
         agreeing = list(range(len(views)))
         enough = min(CONTRADICTED, MOST_MISSES_LEFT * coherence.misses_among(agreeing, distances))
-        while len(agreeing) - 1 > len(views) / 2:
+        while len(agreeing) > max(FEWEST_AGREEING, len(views) / 2 + 1):
             rests = [[view for view in agreeing if view != left_out] for left_out in agreeing]
             left, agreeing = min((coherence.misses_among(rest, distances), rest) for rest in rests)
             if left <= enough:

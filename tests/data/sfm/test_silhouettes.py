@@ -17,6 +17,7 @@ from PIL import Image
 
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm import pipeline, silhouettes
+from gsopt.data.sfm.few_photos import AMPLE_OBSERVATIONS
 from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes, loosely_held
 from gsopt.data.sfm.mapping import registered
 from gsopt.data.sfm.masks import FeatureInput
@@ -24,6 +25,7 @@ from gsopt.data.sfm.photos import find_photos
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.silhouettes import COHERENT, Coherence, coherent_poses, contradicting
 from gsopt.data.sfm.trajectory import compare
+from gsopt.errors import InputError
 from gsopt.geometry.rigid_motion import rigid_motion
 
 THING = [
@@ -157,7 +159,7 @@ def names_of(views: tuple[View, ...]) -> list[str]:
     return [f"{Path(view.name).stem}.png" for view in views]
 
 
-def reconstruction(pycolmap: Any, truth: Any, cameras: Any, names: list[str]) -> Any:
+def reconstruction(pycolmap: Any, truth: Any, cameras: Any, names: list[str], count: int = 200) -> Any:
     """Points on the thing that every photo sees, where `truth` sees them, and cameras that may stand elsewhere."""
     K = truth[0].camera.Ks[0].double().numpy()
     made = pycolmap.Reconstruction()
@@ -166,7 +168,7 @@ def reconstruction(pycolmap: Any, truth: Any, cameras: Any, names: list[str]) ->
     )
     made.add_camera_with_trivial_rig(lens)
     generator = np.random.default_rng(0)
-    points = generator.uniform(-0.5, 0.5, (200, 3))
+    points = generator.uniform(-0.5, 0.5, (count, 3))
     for number, (view, camera, name) in enumerate(zip(truth, cameras, names, strict=True), start=1):
         seen = points @ viewmats([view])[0][:3, :3].T + viewmats([view])[0][:3, 3]
         pixels = (seen @ K.T)[:, :2] / seen[:, 2:]
@@ -235,12 +237,15 @@ def test_points_that_contradict_the_silhouettes_win(
     assert (held(work, made, pycolmap)[0] is not made) == moves
 
 
-def test_advice_follows_where_no_poses_near_fit_the_masks(work: Path, views: tuple[View, ...]) -> None:
-    """Half of the photos stand where others were taken from."""
+@pytest.mark.parametrize(("points", "believed"), [(AMPLE_OBSERVATIONS, True), (AMPLE_OBSERVATIONS - 1, False)])
+def test_advice_follows_where_no_poses_near_fit_the_masks(
+    points: int, believed: bool, work: Path, views: tuple[View, ...]
+) -> None:
+    """Half of the photos stand where others were taken from: many points are believed nevertheless, few are not."""
     pycolmap = pytest.importorskip("pycolmap")
-    swapped = [*views[1::2], *views[::2]]
-    found, advice, said = held(work, made := reconstruction(pycolmap, swapped, swapped, names_of(views)), pycolmap)
-    assert (found is made, said) == (True, [])
+    wrong = misplaced(views, (0, 2, 4, 6))
+    found, advice, said = held(work, made := reconstruction(pycolmap, wrong, wrong, names_of(views), points), pycolmap)
+    assert (found is made, found is None, said) == (believed, not believed, [])
     assert "do not fit these poses" in advice[0]
 
 
@@ -255,6 +260,11 @@ def test_the_photos_whose_outlines_contradict_the_others_are_named(
     wrong: tuple[int, ...], views: tuple[View, ...]
 ) -> None:
     assert contradicting(misplaced(views, wrong)) == list(wrong)
+
+
+def test_nobody_is_named_among_three(views: tuple[View, ...]) -> None:
+    assert contradicting(misplaced(views, (1,))[:4]) == [1]
+    assert contradicting(misplaced(views, (1,))[:3]) == []
 
 
 def test_nobody_is_named_where_half_contradicts_half(views: tuple[View, ...]) -> None:
@@ -309,13 +319,16 @@ def test_a_photo_with_a_wrong_outline_and_many_points_is_named(work: Path, views
     assert f"The outlines in the masks of {names_of(views)[2]} contradict" in advice[0]
 
 
-def test_few_photos_are_held_by_their_masks(room_photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The note of a contradiction is advice in the diagnosis."""
+@pytest.mark.parametrize("believed", [True, False])
+def test_few_photos_are_held_by_their_masks(
+    believed: bool, room_photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The note of a contradiction is advice in the diagnosis, or in the refusal."""
     seen: list[FeatureInput] = []
 
     def contradicted(project: Any, made: Any, inputs: FeatureInput, folder: Path, report: Any) -> tuple[Any, list[str]]:
         seen.append(inputs)
-        return made, ["They do not fit."]
+        return made if believed else None, ["They do not fit."]
 
     monkeypatch.setattr(pipeline, "held_by_silhouettes", contradicted)
     masks = tmp_path / "masks"
@@ -324,6 +337,10 @@ def test_few_photos_are_held_by_their_masks(room_photos: Path, tmp_path: Path, m
         Image.new("L", Image.open(photo).size, 255).save(masks / f"{photo.stem}.png")
     (tmp_path / "work").mkdir()
     config = replace(room.QUICK, masks=str(masks))
+    if not believed:
+        with pytest.raises(InputError, match=r"(?s)No scene: .*They do not fit."):
+            pipeline.write_posed_scene(room_photos, tmp_path / "work", config, lambda line: None)
+        return
     diagnosis, _ = pipeline.write_posed_scene(room_photos, tmp_path / "work", config, lambda line: None)
     assert [inputs.kind for inputs in seen] == ["folder"]
     assert diagnosis.advice[0] == "They do not fit."
