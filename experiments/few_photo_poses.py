@@ -32,7 +32,7 @@ from gsopt.events import to_json, write_atomic
 from gsopt.geometry.farthest_points import farthest_points
 
 RESULTS = Path(__file__).parent / "results" / "few_photo_poses.json"
-HEAD_COUNTS, FOX_COUNTS = (4, 6, 8, 12), (8,)
+HEAD_COUNTS, FOX_COUNTS = (4, 6, 8, 12, 22, 33, 66), (8,)
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from gsopt.data.sfm.consistent_matches import consistent, disagreeing, on_epipolar_lines
 from gsopt.data.sfm.features import ColmapProject, ViewGraph, read_graph
 from gsopt.data.sfm.guided_matches import with_guided_matches
+from gsopt.data.sfm.held_lens import focals_to_try, guessed_lens, hold_lens, support
 from gsopt.data.sfm.joined_features import LearnedMatches, joined_matches
 from gsopt.data.sfm.mapping import (
     SMALLEST_MODEL,
@@ -32,8 +33,6 @@ from gsopt.events import Report
 
 FEW_UP_TO = 16
 """Photos up to which the search of this file is worth its time."""
-FOCALS = (1.2, 1.9, 0.75)
-"""Focal lengths tried where EXIF has none, in longer sides of the photo: 45, 30 and 67 degrees. All are adjusted."""
 FIRST_PAIRS = 5
 """Pairs from which mapping is started, besides COLMAP's own choice."""
 MIN_POSE_INLIERS = 15
@@ -43,8 +42,6 @@ MIN_INLIERS = 18
 MAX_ERROR = 3.0
 """Farthest from the epipolar line, px."""
 MAX_TRIALS = 5000
-ERROR_SCALE = 1.5
-"""Error at which an observation no longer speaks for a reconstruction, px."""
 STRONG_OBSERVATIONS = 150
 """Points seen by the median photo with which the ordinary reconstruction of few photos is trusted."""
 MIN_OBSERVATIONS = 100
@@ -73,9 +70,7 @@ class Attempt:
 
     @property
     def support(self) -> float:
-        """Sum over observations of max(0, 1 - (error / ERROR_SCALE)^2), after Torr and Zisserman 2000."""
-        points = self.reconstruction.points3D.values()
-        return sum(point.track.length() * max(0.0, 1 - (point.error / ERROR_SCALE) ** 2) for point in points)
+        return support(self.reconstruction)
 
 
 @dataclass(frozen=True)
@@ -108,7 +103,7 @@ def find_few_poses(
     """The best reconstruction of all starts, or None, and the view graph it was made from."""
     attempts: list[Attempt] = []
     count = len(hypotheses[0][1].names)
-    focals = _focals(project)
+    focals = focals_to_try(project)
     for where, pairs in hypotheses:
         attempts += _attempts(project, pairs, where, focals)
         placed = max((attempt.photos for attempt in attempts), default=0)
@@ -192,13 +187,6 @@ def _attempts(project: ColmapProject, pairs: PairMatches, where: str, focals: li
             yield Attempt(bundle_adjusted(project, most.reconstruction, lens=False), where)
 
 
-def _focals(project: ColmapProject) -> list[float | None]:
-    """Focal lengths to try: one None if the database has them from EXIF or the user."""
-    with project.opened() as db:
-        known = all(camera.has_prior_focal_length for camera in db.read_all_cameras())
-    return [None] if known else list(FOCALS)
-
-
 def verify(
     project: ColmapProject,
     pairs: PairMatches,
@@ -256,13 +244,8 @@ def _lenses(project: ColmapProject, db: Any, model: Any | None, focal: float | N
         if model is not None and number in model.cameras:
             lenses[number] = model.cameras[number]
         elif focal is not None:
-            length = focal * max(camera.width, camera.height)
-            guess = project.pycolmap.Camera.create_from_model_id(
-                number, camera.model, length, camera.width, camera.height
-            )
-            guess.has_prior_focal_length = True  # otherwise the mapper replaces it by one from two photos
-            db.update_camera(guess)
-            lenses[number] = guess
+            lenses[number] = guessed_lens(project.pycolmap, camera, focal)
+            db.update_camera(lenses[number])
     return lenses
 
 
@@ -272,14 +255,13 @@ def _mapped(project: ColmapProject, first: tuple[int, int] | None, start: Path |
     options.min_num_matches = MIN_INLIERS
     options.extract_colors = False
     options.structure_less_registration_fallback = False  # takes minutes, and places wrongly what has few matches
-    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    hold_lens(options)
     options.triangulation.ignore_two_view_tracks = False
     mapper = options.mapper
     mapper.init_min_num_inliers = MIN_INLIERS
     mapper.init_min_tri_angle = 6.0
     mapper.abs_pose_min_num_inliers = MIN_POSE_INLIERS
     mapper.abs_pose_min_inlier_ratio = 0.25
-    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
     if first is not None:
         options.init_image_id1, options.init_image_id2 = first
     options.multiple_models = False

@@ -46,7 +46,7 @@ def held_by_silhouettes(
 ) -> tuple[Any | None, list[str]]:
     """The reconstruction, or a copy with poses on which the silhouettes agree, and advice where nothing near makes them
     agree; `folder` is for the work. A copy lacks photos whose outlines contradict all others and that few points hold.
-    None where few points hold all photos and no outlines agree.
+    Returns no reconstruction where few points hold all photos and no outlines agree.
     """
     images = {reconstruction.image(number).name: number for number in reconstruction.reg_image_ids()}
     if inputs.masks is None or images.keys() & set(inputs.unmasked):

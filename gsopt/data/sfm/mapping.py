@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
+from gsopt.data.sfm.held_lens import focals_to_try, guessed_lens, hold_lens, support
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.events import Report
 
@@ -21,6 +22,8 @@ INCREMENTAL_UP_TO = 300
 """Photos up to which `auto` maps incrementally: slower per photo, but it loses fewer."""
 ENOUGH_PLACED = 0.9
 """Share of the photos below which `auto` tries the other mapper."""
+HELD = "held-lens"
+"""The mapper that `auto` tries second."""
 SMALLEST_MODEL = 3
 MIN_SHARED_POINTS = 15
 """Points a photo must share with another one for its pose to count."""
@@ -76,7 +79,7 @@ def find_poses(project: ColmapProject, graph: ViewGraph, report: Report) -> Mapp
             break
     if best is None:
         return None
-    if best.mapper != "incremental":
+    if best.mapper not in ("incremental", HELD):
         best = replace(best, reconstruction=_settled(project, best.reconstruction))
     best = replace(best, reconstruction=adjusted(project, best.reconstruction))
     keep_coherent(best.reconstruction)
@@ -84,10 +87,10 @@ def find_poses(project: ColmapProject, graph: ViewGraph, report: Report) -> Mapp
 
 
 def mappers_to_try(config: SfmConfig, count: int) -> list[str]:
-    """Mappers in order: `auto` is a first choice, and another in case that leaves many photos out."""
+    """Mappers in order: `auto` is a first choice, and others in case that leaves many photos out."""
     if config.mapper != "auto":
         return [config.mapper]
-    return ["incremental", "hybrid"] if count <= INCREMENTAL_UP_TO else ["hybrid", "incremental"]
+    return ["incremental", HELD, "hybrid"] if count <= INCREMENTAL_UP_TO else ["hybrid", "incremental", HELD]
 
 
 def run_mapper(project: ColmapProject, mapper: str, graph: ViewGraph) -> list[Any]:
@@ -95,7 +98,10 @@ def run_mapper(project: ColmapProject, mapper: str, graph: ViewGraph) -> list[An
     project.pycolmap.set_random_seed(project.config.seed)
     target = project.database.with_name(mapper)
     target.mkdir()
-    models = _incremental(project, target) if mapper == "incremental" else _global(project, target, graph)
+    if mapper == HELD:
+        models = _held(project, target)
+    else:
+        models = _incremental(project, target) if mapper == "incremental" else _global(project, target, graph)
     for model in models:
         keep_coherent(model)
     if mapper == "hybrid" and models and len(registered(models[0])) < len(graph.features):
@@ -189,6 +195,38 @@ def _incremental(project: ColmapProject, target: Path, start: Path | str = "") -
         project.database, project.photos, target, options=options, input_path=start
     )
     return [model for _, model in sorted(models.items())]
+
+
+def _held(project: ColmapProject, target: Path) -> list[Any]:
+    """The largest reconstruction with the first focal length that places enough photos, adjusted, and what is beside
+    it; else the best of all focal lengths."""
+    options = incremental_options(project)
+    hold_lens(options)
+    found: list[list[Any]] = []
+    for number, focal in enumerate(focals_to_try(project)):
+        folder = target / str(number)
+        folder.mkdir()
+        guessed = _with_focal(project, folder, focal)
+        models = project.pycolmap.incremental_mapping(guessed.database, project.photos, folder, options=options)
+        if not models:
+            continue
+        largest, *others = sorted(models.values(), key=lambda model: (-model.num_reg_images(), min(registered(model))))
+        found.append([bundle_adjusted(project, largest), *others])
+        if largest.num_reg_images() >= ENOUGH_PLACED * largest.num_images():
+            break
+    return max(found, key=lambda models: (models[0].num_reg_images(), support(models[0])), default=[])
+
+
+def _with_focal(project: ColmapProject, folder: Path, focal: float | None) -> ColmapProject:
+    """A copy of the database in `folder` in which cameras without a known focal length have this one."""
+    guessed = replace(project, database=folder / "database.db")
+    shutil.copyfile(project.database, guessed.database)
+    if focal is not None:
+        with guessed.opened() as db:
+            for camera in db.read_all_cameras():
+                if not camera.has_prior_focal_length:
+                    db.update_camera(guessed_lens(project.pycolmap, camera, focal))
+    return guessed
 
 
 def _global(project: ColmapProject, target: Path, graph: ViewGraph) -> list[Any]:

@@ -216,7 +216,7 @@ class _Run:
         return graph_again, again
 
     def _held(self, project: ColmapProject, mapped: MappingResult, inputs: FeatureInput) -> MappingResult | None:
-        """With poses on which silhouettes agree, or a note that they do not; None if nothing speaks for the poses."""
+        """With poses on which silhouettes agree, with a note that they do not, or None if nothing speaks for the poses."""
         found, notes = held_by_silhouettes(project, mapped.reconstruction, inputs, self.work / "held", self.report)
         self.notes += notes
         return replace(mapped, reconstruction=found) if found is not None else None

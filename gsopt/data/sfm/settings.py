@@ -24,7 +24,8 @@ class SfmConfig:
 
     mapper: Mapper = "auto"
     """incremental adds photo by photo; global places all at once; hybrid is global, then incremental for what was
-    left out; auto takes incremental up to 300 photos and hybrid beyond, and tries the other when many are left out."""
+    left out; auto takes incremental up to 300 photos and hybrid beyond, and where many are left out tries incremental
+    with the lens held, and the other."""
     matching: Matching = "auto"
     """Pairs of photos to compare: all with all (exhaustive), neighbors in time and loops (sequential), look-alikes
     (retrieval); auto takes exhaustive up to 200 photos, sequential for a video, retrieval otherwise."""

@@ -43,13 +43,14 @@ CHAIN = {(0, 1): 500, (1, 2): 400, (2, 3): 300}
 
 
 @pytest.mark.parametrize(
-    ("mapper", "runs"), [("incremental", "_incremental"), ("global", "_global"), ("hybrid", "_global")]
+    ("mapper", "runs"),
+    [("incremental", "_incremental"), ("held-lens", "_held"), ("global", "_global"), ("hybrid", "_global")],
 )
 def test_the_mapper_that_is_asked_for_runs(
     mapper: str, runs: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ran: list[str] = []
-    for name in ("_incremental", "_global"):
+    for name in ("_incremental", "_held", "_global"):
         monkeypatch.setattr(mapping, name, lambda *_, name=name: ran.append(name) or [])
     colmap = SimpleNamespace(set_random_seed=ran.append)
     project = SimpleNamespace(pycolmap=colmap, config=SfmConfig(seed=7), database=tmp_path / "database.db")
@@ -151,8 +152,8 @@ def test_what_auto_becomes() -> None:
     assert choose_matching(auto, 201, is_video=False) == "retrieval"
     assert choose_matching(auto, 50, is_video=True) == "sequential"
     assert choose_matching(replace(auto, matching="retrieval"), 5, is_video=True) == "retrieval"
-    assert mappers_to_try(auto, 300) == ["incremental", "hybrid"]
-    assert mappers_to_try(auto, 301) == ["hybrid", "incremental"]
+    assert mappers_to_try(auto, 300) == ["incremental", "held-lens", "hybrid"]
+    assert mappers_to_try(auto, 301) == ["hybrid", "incremental", "held-lens"]
     assert mappers_to_try(replace(auto, mapper="global"), 10) == ["global"]
 
 

@@ -12,6 +12,7 @@ from test_answers import CHAIN, NAMES, graph
 
 from gsopt.data.sfm import few_photos, mapping
 from gsopt.data.sfm.few_photos import Attempt, keep_confirmed, observations
+from gsopt.data.sfm.held_lens import focals_to_try
 from gsopt.data.sfm.mapping import covisible_groups, keep_coherent, mappers_to_try, off_center, seed_photos
 from gsopt.data.sfm.settings import SfmConfig
 
@@ -125,7 +126,10 @@ def test_the_principal_point_of_ten_photos_may_move_a_little(
     assert mapping.adjusted(None, model).center == moved  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("count", "mappers"), [(300, ["incremental", "hybrid"]), (301, ["hybrid", "incremental"])])
+@pytest.mark.parametrize(
+    ("count", "mappers"),
+    [(300, ["incremental", "held-lens", "hybrid"]), (301, ["hybrid", "incremental", "held-lens"])],
+)
 def test_few_photos_are_mapped_one_by_one_first(count: int, mappers: list[str]) -> None:
     assert mappers_to_try(SfmConfig(), count) == mappers
     assert mappers_to_try(SfmConfig(mapper="global"), count) == ["global"]
@@ -140,7 +144,7 @@ def test_seed_photos_are_the_best_connected_ones() -> None:
     assert seed_photos(ties, 4) == ["2.jpg", "3.jpg", "1.jpg", "0.jpg"]
 
 
-@pytest.mark.parametrize(("first", "tried"), [(9, ["incremental"]), (8, ["incremental", "hybrid"])])
+@pytest.mark.parametrize(("first", "tried"), [(9, ["incremental"]), (8, ["incremental", "held-lens", "hybrid"])])
 def test_another_mapper_is_tried_where_less_than_nine_tenths_are_placed(
     first: int, tried: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -266,7 +270,7 @@ def test_focal_lengths_are_tried_where_one_is_not_known(known: list[bool], focal
             return [SimpleNamespace(has_prior_focal_length=one) for one in known]
 
     project: Any = SimpleNamespace(opened=Database)
-    assert few_photos._focals(project) == focals
+    assert focals_to_try(project) == focals
 
 
 def test_mapping_starts_from_the_five_best_pairs_too_and_the_best_result_is_adjusted(
