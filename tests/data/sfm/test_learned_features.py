@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -166,6 +167,63 @@ def test_few_photos_get_learned_features_too_where_they_are_installed(
     run = pipeline._Run(pycolmap, tmp_path / source, tmp_path, SfmConfig(**settings), lambda line: None)
     photos = [cast("Photo", object())] * count
     assert run._chosen_features(photos) == want
+
+
+@pytest.mark.parametrize(
+    ("count", "placed", "source", "settings", "installed", "want"),
+    [
+        (60, 53, "photos", {}, True, True),
+        (60, 54, "photos", {}, True, False),
+        (60, None, "photos", {}, True, True),
+        (61, 3, "photos", {}, True, False),
+        (17, 3, "photos", {}, True, True),
+        (16, 3, "photos", {}, True, False),
+        (60, 3, "photos", {}, False, False),
+        (60, 3, "photos", {"features": "sift"}, True, False),
+        (60, 3, "photos", {"matching": "retrieval"}, True, False),
+        (60, 3, "film.mp4", {}, True, False),
+    ],
+)
+def test_many_photos_get_learned_features_where_sift_leaves_out_more_than_a_tenth(
+    count: int,
+    placed: int | None,
+    source: str,
+    settings: dict[str, Any],
+    installed: bool,
+    want: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pipeline, "find_spec", lambda name: object() if installed else None)
+    (tmp_path / source).touch()
+    run = pipeline._Run(pycolmap, tmp_path / source, tmp_path, SfmConfig(**settings), lambda line: None)
+    mapped: Any = None if placed is None else SimpleNamespace(names=range(placed))
+    assert run._wants_learned([cast("Photo", object())] * count, mapped) == want
+
+
+@pytest.mark.parametrize(("first", "second", "kept"), [(4, 5, True), (None, 3, True), (4, 4, False), (4, None, False)])
+def test_what_places_more_photos_is_kept(
+    first: int | None, second: int | None, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second look has a database of its own, and the record says which features were used."""
+    made, _ = project(tmp_path / "photos", "sift")
+    run = pipeline._Run(pycolmap, tmp_path, tmp_path, SfmConfig(features="sift"), lambda line: None)
+    graphs: list[str] = []
+    mapped, again = (None if count is None else SimpleNamespace(names=range(count)) for count in (first, second))
+
+    def graph(project: ColmapProject, *_: Any) -> tuple[Any, str]:
+        assert (run.config.features, project.config.features) == ("both", "both")
+        assert project.database.parent.is_dir()
+        assert project.database.parent != made.database.parent
+        graphs.append("again")
+        return "again", "exhaustive"
+
+    monkeypatch.setattr(run, "_graph", graph)
+    monkeypatch.setattr(run, "_mapped", lambda project, graph, frames: again)
+    found: Any = run._learned(made, [], cast("Any", None), cast("Any", "first"), cast("Any", mapped))
+    assert graphs == ["again"]
+    assert found == (("again", again) if kept else ("first", mapped))
+    assert run.config.features == ("both" if kept else "sift")
 
 
 @pytest.mark.parametrize("name", ["orb", "SIFT", ""])
