@@ -18,7 +18,7 @@ from PIL import Image
 from gsopt.data.scene import View, load_scene
 from gsopt.data.sfm import pipeline, silhouettes
 from gsopt.data.sfm.few_photos import AMPLE_OBSERVATIONS
-from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes, loosely_held
+from gsopt.data.sfm.held_by_silhouettes import REFUTED, held_by_silhouettes, loosely_held
 from gsopt.data.sfm.mapping import registered
 from gsopt.data.sfm.masks import FeatureInput
 from gsopt.data.sfm.photos import find_photos
@@ -237,13 +237,20 @@ def test_points_that_contradict_the_silhouettes_win(
     assert (held(work, made, pycolmap)[0] is not made) == moves
 
 
-@pytest.mark.parametrize(("points", "believed"), [(AMPLE_OBSERVATIONS, True), (AMPLE_OBSERVATIONS - 1, False)])
+@pytest.mark.parametrize(
+    ("points", "misses", "believed"),
+    [(AMPLE_OBSERVATIONS, REFUTED, True), (AMPLE_OBSERVATIONS - 1, REFUTED, False), (399, REFUTED - 0.01, True)],
+)
 def test_advice_follows_where_no_poses_near_fit_the_masks(
-    points: int, believed: bool, work: Path, views: tuple[View, ...]
+    points: int, misses: float, believed: bool, work: Path, views: tuple[View, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half of the photos stand where others were taken from: many points are believed nevertheless, few are not."""
     pycolmap = pytest.importorskip("pycolmap")
     wrong = misplaced(views, (0, 2, 4, 6))
+    real = coherent_poses(wrong)
+    assert real is not None
+    assert real.after > REFUTED
+    monkeypatch.setattr("gsopt.data.sfm.held_by_silhouettes.coherent_poses", lambda views: replace(real, after=misses))
     found, advice, said = held(work, made := reconstruction(pycolmap, wrong, wrong, names_of(views), points), pycolmap)
     assert (found is made, found is None, said) == (believed, not believed, [])
     assert "do not fit these poses" in advice[0]
