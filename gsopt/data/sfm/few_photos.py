@@ -31,8 +31,6 @@ from gsopt.data.sfm.mapping import (
 from gsopt.data.sfm.pair_matches import PairMatches, inside, match_features, read_matches, without_background
 from gsopt.events import Report
 
-FEW_UP_TO = 16
-"""Photos up to which the search of this file is worth its time."""
 FIRST_PAIRS = 5
 """Pairs from which mapping is started, besides COLMAP's own choice."""
 MIN_POSE_INLIERS = 15

@@ -18,12 +18,14 @@ from gsopt.data.sfm.held_lens import focals_to_try, guessed_lens, hold_lens, sup
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.events import Report
 
+FEW_UP_TO = 16
+"""Photos up to which the search of few_photos.py, which holds the lens too, is worth its time."""
 INCREMENTAL_UP_TO = 300
 """Photos up to which `auto` maps incrementally: slower per photo, but it loses fewer."""
 ENOUGH_PLACED = 0.9
 """Share of the photos below which `auto` tries the other mapper."""
 HELD = "held-lens"
-"""The mapper that `auto` tries second."""
+"""The mapper that `auto` tries second, of more photos than a few."""
 SMALLEST_MODEL = 3
 MIN_SHARED_POINTS = 15
 """Points a photo must share with another one for its pose to count."""
@@ -90,6 +92,8 @@ def mappers_to_try(config: SfmConfig, count: int) -> list[str]:
     """Mappers in order: `auto` is a first choice, and others in case that leaves many photos out."""
     if config.mapper != "auto":
         return [config.mapper]
+    if count <= FEW_UP_TO:
+        return ["incremental", "hybrid"]
     return ["incremental", HELD, "hybrid"] if count <= INCREMENTAL_UP_TO else ["hybrid", "incremental", HELD]
 
 

@@ -6,6 +6,7 @@ Nothing is left behind but the finished folder: all work happens under a hidden 
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -28,7 +29,7 @@ from gsopt.data.sfm import diagnosis, features, few_photos, known_poses, mapping
 from gsopt.data.sfm.child_process import run_in_child
 from gsopt.data.sfm.diagnosis import Diagnosis
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
-from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes
+from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes, outline_misses
 from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, match_joined
 from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
@@ -38,6 +39,7 @@ from gsopt.data.sfm.photos import Photo, RejectedFile, find_photos, natural, rea
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.silhouettes import CONTRADICTED
 from gsopt.data.sfm.video import extract_frames, is_video
 from gsopt.data.sfm.write_scene import SCENE, write_scene
 from gsopt.data.working_folder import sweep, working_folder
@@ -186,7 +188,7 @@ class _Run:
     def _wants_learned(self, photos: list[Photo], mapped: MappingResult | None) -> bool:
         """True where SIFT, which nobody has asked for, leaves out many of the photos of one object."""
         placed = len(mapped.names) if mapped is not None else 0
-        worth = few_photos.FEW_UP_TO < len(photos) <= LEARNED_UP_TO and placed < mapping.ENOUGH_PLACED * len(photos)
+        worth = mapping.FEW_UP_TO < len(photos) <= LEARNED_UP_TO and placed < mapping.ENOUGH_PLACED * len(photos)
         matching = features.choose_matching(self.config, len(photos), is_video(self.source))
         return worth and self.asked == "auto" and matching == "exhaustive" and _learned_installed()
 
@@ -224,7 +226,7 @@ class _Run:
     def _is_few(self, photos: list[Photo]) -> bool:
         """True where every photo is dear and nobody has chosen another way."""
         chosen = (self.config.mapper, self.config.matching) != ("auto", "auto")
-        return mapping.SMALLEST_MODEL <= len(photos) <= few_photos.FEW_UP_TO and not chosen
+        return mapping.SMALLEST_MODEL <= len(photos) <= mapping.FEW_UP_TO and not chosen
 
     def _few(
         self,
@@ -237,17 +239,29 @@ class _Run:
         """Look a second time, with thorough features, where what was found cannot be trusted; returns the better."""
         trust = few_photos.trust(project, mapped)
         placed = len(mapped.names) if mapped is not None else 0
-        if placed == len(photos) and trust >= few_photos.STRONG_OBSERVATIONS:
+        misses = self._outline_misses(mapped, inputs)
+        if placed == len(photos) and trust >= few_photos.STRONG_OBSERVATIONS and misses < CONTRADICTED:
             return graph, mapped
         self.report(f"few photos with little in common: looking thoroughly for features (masks: {inputs.kind})")
         project = replace(project, database=self.work / "thorough.db")
         features.extract(project, photos, None, thorough=True)
         hypotheses = few_photos.match_few(project, inputs.masks, self.learned)
         again, graph_again = few_photos.find_few_poses(project, hypotheses.matches, self.report)
-        if trust >= few_photos.MIN_OBSERVATIONS and placed >= (len(again.names) if again is not None else 0):
+        if CONTRADICTED <= misses < math.inf:
+            better = misses > self._outline_misses(again, inputs)
+        else:
+            better = trust < few_photos.MIN_OBSERVATIONS or placed < (len(again.names) if again is not None else 0)
+        if not better:
             return graph, mapped
         self.notes += [diagnosis.TURNTABLE] if hypotheses.turntable else []
         return graph_again, again
+
+    def _outline_misses(self, mapped: MappingResult | None, inputs: FeatureInput) -> float:
+        """Misses of the outlines of what was found, px; infinite for nothing."""
+        if mapped is None:
+            return math.inf
+        found = outline_misses(mapped.reconstruction, inputs, self.work / "outlines")
+        return 0.0 if found is None else found
 
     def _held(self, project: ColmapProject, mapped: MappingResult, inputs: FeatureInput) -> MappingResult | None:
         """With poses on which silhouettes agree, or with a note that they do not, or None if nothing confirms them."""

@@ -152,6 +152,7 @@ def test_what_auto_becomes() -> None:
     assert choose_matching(auto, 201, is_video=False) == "retrieval"
     assert choose_matching(auto, 50, is_video=True) == "sequential"
     assert choose_matching(replace(auto, matching="retrieval"), 5, is_video=True) == "retrieval"
+    assert mappers_to_try(auto, 16) == ["incremental", "hybrid"]
     assert mappers_to_try(auto, 300) == ["incremental", "held-lens", "hybrid"]
     assert mappers_to_try(auto, 301) == ["hybrid", "incremental", "held-lens"]
     assert mappers_to_try(replace(auto, mapper="global"), 10) == ["global"]

@@ -128,7 +128,12 @@ def test_the_principal_point_of_ten_photos_may_move_a_little(
 
 @pytest.mark.parametrize(
     ("count", "mappers"),
-    [(300, ["incremental", "held-lens", "hybrid"]), (301, ["hybrid", "incremental", "held-lens"])],
+    [
+        (16, ["incremental", "hybrid"]),
+        (17, ["incremental", "held-lens", "hybrid"]),
+        (300, ["incremental", "held-lens", "hybrid"]),
+        (301, ["hybrid", "incremental", "held-lens"]),
+    ],
 )
 def test_few_photos_are_mapped_one_by_one_first(count: int, mappers: list[str]) -> None:
     assert mappers_to_try(SfmConfig(), count) == mappers
@@ -144,7 +149,7 @@ def test_seed_photos_are_the_best_connected_ones() -> None:
     assert seed_photos(ties, 4) == ["2.jpg", "3.jpg", "1.jpg", "0.jpg"]
 
 
-@pytest.mark.parametrize(("first", "tried"), [(9, ["incremental"]), (8, ["incremental", "held-lens", "hybrid"])])
+@pytest.mark.parametrize(("first", "tried"), [(18, ["incremental"]), (17, ["incremental", "held-lens", "hybrid"])])
 def test_another_mapper_is_tried_where_less_than_nine_tenths_are_placed(
     first: int, tried: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,8 +165,8 @@ def test_another_mapper_is_tried_where_less_than_nine_tenths_are_placed(
     monkeypatch.setattr(mapping, "adjusted", lambda project, model: model)
     monkeypatch.setattr(mapping, "_settled", lambda project, model: model)
     project: Any = SimpleNamespace(config=SfmConfig())
-    ten = replace(graph({}), features={f"{i}.jpg": 900 for i in range(1, 11)})
-    found = mapping.find_poses(project, ten, lambda line: None)
+    twenty = replace(graph({}), features={f"{i}.jpg": 900 for i in range(1, 21)})
+    found = mapping.find_poses(project, twenty, lambda line: None)
     assert runs == tried
     assert found is not None
     assert (found.mapper, found.names) == ("incremental", {f"{i}.jpg" for i in range(1, first + 1)})

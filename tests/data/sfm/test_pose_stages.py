@@ -88,25 +88,63 @@ def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert looks == [True]
 
 
-@pytest.mark.parametrize(
-    ("trust", "again", "first"),
-    [(100, None, True), (99, None, False), (100, 4, True), (100, 5, False), (149, 3, True), (149, 6, False)],
-)
-def test_a_second_look_must_place_more_photos_than_a_first_one_that_can_be_trusted(
-    trust: int, again: int | None, first: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """The first look has placed four of six photos."""
-    mapped, second = (None if n is None else SimpleNamespace(names=[""] * n) for n in (4, again))
+def second_look(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    trust: int,
+    placed: tuple[int | None, int | None],
+    misses: tuple[float | None, float | None] = (None, None),
+) -> bool:
+    """True where six photos are looked at twice and the second result is taken; photos placed and misses by look."""
+    looks = [None if n is None else SimpleNamespace(names=[""] * n, reconstruction=row) for row, n in enumerate(placed)]
     monkeypatch.setattr(pipeline.features, "extract", lambda *_, **__: None)
+    monkeypatch.setattr(pipeline, "outline_misses", lambda reconstruction, *_: misses[reconstruction])
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True))
-    monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (second, "another graph"))
+    monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (looks[1], "another graph"))
     run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
     project: Any = ColmapProject(SimpleNamespace(), tmp_path / "database.db", tmp_path, SfmConfig())  # type: ignore[arg-type]
     inputs: Any = SimpleNamespace(kind="none", masks=None)
-    found = run._few(project, [None] * 6, inputs, "graph", mapped)  # type: ignore[list-item, arg-type]
-    assert found == (("graph", mapped) if first else ("another graph", second))
-    assert len(run.notes) == int(not first)
+    found: Any = run._few(project, [None] * 6, inputs, "graph", looks[0])  # type: ignore[list-item, arg-type]
+    taken = found[0] == "another graph"
+    assert found == (("another graph", looks[1]) if taken else ("graph", looks[0]))
+    assert len(run.notes) == int(taken)
+    return taken
+
+
+@pytest.mark.parametrize(
+    ("trust", "again", "taken"),
+    [(100, None, False), (99, None, True), (100, 4, False), (100, 5, True), (149, 3, False), (149, 6, True)],
+)
+def test_a_second_look_must_place_more_photos_than_a_first_one_that_can_be_trusted(
+    trust: int, again: int | None, taken: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert second_look(tmp_path, monkeypatch, trust, (4, again)) == taken
+
+
+@pytest.mark.parametrize(
+    ("placed", "misses", "taken"),
+    [
+        ((6, 5), (1.99, 0.1), False),
+        ((6, 5), (2.0, 1.9), True),
+        ((6, 5), (2.0, 2.0), False),
+        ((6, 6), (8.6, 2.5), True),
+        ((6, None), (8.6, None), False),
+        ((4, 5), (8.6, 9.0), False),
+        ((6, 5), (8.6, None), True),
+        ((None, 3), (None, 9.0), True),
+        ((None, None), (None, None), True),
+    ],
+)
+def test_poses_that_the_outlines_contradict_are_replaced_by_those_they_contradict_less(
+    placed: tuple[int | None, int | None],
+    misses: tuple[float | None, float | None],
+    taken: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """However many points hold them."""
+    assert second_look(tmp_path, monkeypatch, 0 if placed[0] is None else 500, placed, misses) == taken
 
 
 @pytest.mark.parametrize(
