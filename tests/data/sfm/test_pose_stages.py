@@ -59,7 +59,7 @@ def test_points_seen_from_one_side_or_far_from_their_pixels_are_left_out(off: fl
     sound = [5.0, 6, 7, 8, 9, 10, 12, 14, 16, 20] * 4
     flat = [1.0, 1.4] if off == 0 else []  # too close to one side
     angles = [*sound, 1.6, 2.4, 10.0, *flat]
-    project: Any = SimpleNamespace(pycolmap=pycolmap, config=SimpleNamespace(focal=1000.0))
+    project: Any = SimpleNamespace(pycolmap=pycolmap, config=SfmConfig(focal=1000.0))
     model = rays(pycolmap, angles, off={len(sound) + 2: off})
     kept = mapping.bundle_adjusted(project, model)
     tracks = [kept.points3D[i + 1].track.length() if i + 1 in kept.points3D else 0 for i in range(len(angles))]
