@@ -34,7 +34,7 @@ from gsopt.farm.job import Job, Outcome
 from gsopt.farm.serve import serve
 from gsopt.farm.worker import Worker
 from gsopt.finetune import evaluation as prior_evaluation
-from gsopt.finetune import reconstruction_pairs
+from gsopt.finetune import reconstruction_pairs, serve_pairs
 from gsopt.results import evaluation
 from gsopt.sds.priors import view_conditioned
 
@@ -111,6 +111,7 @@ class ForkedChild:
 PROGRAMS: dict[str, Callable[[], None]] = {
     "gsopt.data.sfm.child_process": child_process.main,
     "gsopt.benchmark.suite.worker": lambda: serve(single_run.answer),
+    "gsopt.finetune.serve_pairs": lambda: serve(serve_pairs.handle),
     "gsopt.cli.serve_jobs": lambda: serve(serve_jobs.handle),
 }
 FORKING = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedChild})
