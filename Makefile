@@ -43,9 +43,11 @@ bench: $(VENV)/.for-test
 stress: $(VENV)/.for-test
 	OMP_NUM_THREADS=1 GSOPT_STRESS=full $(PY) -m pytest tests/raster/test_stress.py
 
-# Every call that changes the disk is made to fail, in every way: killed, full, broken, half written. An hour or two.
+# Every call that changes the disk is made to fail: killed, full, broken, half written. An hour. Each call of a long work meets
+# one of these in turn; EVERY=all: each call all of them, which takes hours.
+EVERY ?= full
 every-write: $(VENV)/.for-test
-	OMP_NUM_THREADS=1 GSOPT_EVERY_WRITE=full $(PY) -m pytest tests/every_write
+	OMP_NUM_THREADS=1 GSOPT_EVERY_WRITE=$(EVERY) $(PY) -m pytest -s tests/every_write
 
 # Coverage-guided fuzzing of every reader; inputs that reach new code are kept in tests/corpus, which `make test` replays.
 # An hour as it stands: SECONDS for each of some thirty readers.

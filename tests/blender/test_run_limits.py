@@ -51,6 +51,14 @@ def test_numbers_are_those_of_blenders_properties(value: object, held: float | N
     assert number(value) == held
 
 
+@pytest.mark.parametrize("left_out", ["seq", "v"])
+def test_a_line_without_one_of_its_two_numbers_is_no_event(left_out: str) -> None:
+    whole_line = line("warning", message="a")
+    lacking = {name: value for name, value in json.loads(whole_line).items() if name != left_out}
+    lines = [json.dumps(lacking).encode(), whole_line]
+    assert [event["seq"] for event in run_follower.events_in(lines, Path("events.jsonl"))] == [0]
+
+
 def test_the_newest_fifty_messages_are_kept_and_none_twice_in_a_row() -> None:
     run = Run(Path())
     for i in range(60):

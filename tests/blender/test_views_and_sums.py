@@ -12,7 +12,7 @@ import pytest
 from made_splats import random_splats
 
 from blender_addon.core import colmap, dataset, statistics
-from blender_addon.core.cameras import GL_FROM_CV, read_views
+from blender_addon.core.cameras import read_views
 from blender_addon.core.errors import GsoptError, InputError
 from blender_addon.core.statistics import Filter, summary
 
@@ -82,7 +82,7 @@ def test_colmap_poses_are_inverted_and_turned(tmp_path: Path) -> None:
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     world_from_cv = np.eye(4)
     world_from_cv[:3, :3], world_from_cv[:3, 3] = turn.T, -turn.T @ [0.5, -1.0, 2.0]
-    assert np.allclose(view.world_from_cam, world_from_cv @ GL_FROM_CV)
+    assert np.allclose(view.world_from_cam, world_from_cv @ np.diag([1, -1, -1, 1]))
     assert (view.name, view.width, view.shift) == ("a b", 200, pytest.approx((0.05, 0.025)))
     for cut in range(0, len(images), 7):
         (sparse / "images.bin").write_bytes(images[:cut])

@@ -6,31 +6,36 @@ Every job runs in a fork, so that torch is imported once. LD_PRELOAD names the c
 from __future__ import annotations
 
 import ctypes
+import functools
+import gc
 import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any, NoReturn, Self
 
 import torch
+from PIL import Image
 
 import gsopt.cli.train  # noqa: F401 (jobs would import it anew)
 from gsopt.benchmark.suite import single_run
-from gsopt.benchmark.suite.single_run import RunFailed
-from gsopt.cli import main
+from gsopt.cli import main, serve_jobs, train_flags
 from gsopt.config.train import InitConfig, SparseConfig, TrainConfig
 from gsopt.data.sfm import child_process
-from gsopt.errors import GsoptError
 from gsopt.farm import open as open_farm
+from gsopt.farm import worker as farm_worker
 from gsopt.farm.job import Job, Outcome
-from gsopt.finetune import evaluation, reconstruction_pairs
+from gsopt.farm.serve import serve
+from gsopt.farm.worker import Worker
+from gsopt.finetune import evaluation as prior_evaluation
+from gsopt.finetune import reconstruction_pairs, serve_pairs
+from gsopt.results import evaluation
 from gsopt.sds.priors import view_conditioned
 
 FEW = TrainConfig(
@@ -42,27 +47,39 @@ FEW = TrainConfig(
 SMALLER = (
     (reconstruction_pairs, "reconstruction_config", lambda length, seed: replace(FEW.with_steps(6), seed=seed)),
     (reconstruction_pairs, "HELD_OUT_VIEWS", 1),
-    (evaluation, "MAX_RENDERS", 1),
-    (evaluation, "NOISE_STEPS_EVALUATED", (500,)),
+    (prior_evaluation, "MAX_RENDERS", 1),
+    (prior_evaluation, "NOISE_STEPS_EVALUATED", (500,)),
     (view_conditioned, "UNET_WIDTHS", (16, 16, 16)),
 )
 """Makes the training of a prior small: how much it learns is not what is tested."""
 
 
 class ForkedChild:
-    """Takes the place of Popen for the child of `gsopt sfm`: a fork, so that COLMAP is imported once."""
+    """Takes the place of Popen for a program that is a module of gsopt: a fork, so that its imports are made once."""
 
-    def __init__(self, command: list[str], stderr: IO[bytes], **_: Any) -> None:
+    def __init__(
+        self,
+        command: Sequence[str],
+        stderr: IO[bytes],
+        env: Mapping[str, str],
+        start_new_session: bool = False,
+        **_: Any,
+    ) -> None:
         (stdin, self.stdin), (self.stdout, stdout) = (
             (os.fdopen(end, mode, encoding="utf-8") for end, mode in zip(os.pipe(), "rw", strict=True)) for _ in "io"
         )
+        self._code: int | None = None
         self.pid = os.fork()
         if self.pid == 0:
             self.stdin.close()
+            self.stdout.close()
+            if start_new_session:
+                os.setsid()
             for file, number in ((stdin, 0), (stdout, 1), (stderr, 2)):
                 os.dup2(file.fileno(), number)
-            sys.argv, sys.stdin = command[2:], stdin
-            child_process.main()
+            os.environ.update(env)
+            sys.argv, sys.stdin = list(command[2:]), stdin
+            PROGRAMS[command[2]]()
             os._exit(1)
         stdin.close()
         stdout.close()
@@ -74,40 +91,52 @@ class ForkedChild:
         self.stdin.close()
         self.stdout.close()
 
-    def wait(self) -> int:
-        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+    def poll(self) -> int | None:
+        return self._ended(os.WNOHANG)
+
+    def wait(self) -> int | None:
+        return self._ended(0)
+
+    def _ended(self, flags: int) -> int | None:
+        if self._code is None:
+            ended, status = os.waitpid(self.pid, flags)
+            self._code = os.waitstatus_to_exitcode(status) if ended else None
+        return self._code
 
     def kill(self) -> None:
-        with suppress(ProcessLookupError):
+        if self.poll() is None:
             os.kill(self.pid, signal.SIGKILL)
 
 
+PROGRAMS: dict[str, Callable[[], None]] = {
+    "gsopt.data.sfm.child_process": child_process.main,
+    "gsopt.benchmark.suite.worker": lambda: serve(single_run.answer),
+    "gsopt.finetune.serve_pairs": lambda: serve(serve_pairs.handle),
+    "gsopt.cli.serve_jobs": lambda: serve(serve_jobs.handle),
+}
+FORKING = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedChild})
+
+
+class ForkWorker(Worker):
+    """A worker, and what it starts, is a fork. Blender's workers, of another farm, are programs of their own."""
+
+    def do(self, job: Job, request: Any, canceled: Callable[[], bool] = lambda: False) -> Outcome:
+        farm_worker.subprocess = FORKING  # type: ignore[assignment]
+        return super().do(job, request, canceled)
+
+
 class ForkFarm:
-    """Takes the place of the farm of `gsopt bench --suite`: a fork for every run, so that torch is imported once."""
+    """Takes the place of the farm of `gsopt bench --suite`: one worker, in a fork, so that torch is imported once."""
 
     def run(self, jobs: list[Job], report: Any = None) -> Iterator[Outcome]:
-        for job in jobs:
-            reader, writer = os.pipe()
-            child = os.fork()
-            if child == 0:
-                try:
-                    with open(writer, "w") as file:
-                        json.dump(answer_of(job), file)
-                finally:
-                    os._exit(0)
-            os.close(writer)
-            with open(reader) as file:
-                answer = json.loads(file.read() or '{"failed": "it died"}')
-            os.waitpid(child, 0)
-            failed = answer.get("failed")
-            yield Outcome(job, "failed", error=failed) if failed else Outcome(job, "done", answer)
-
-
-def answer_of(job: Job) -> dict[str, Any]:
-    try:
-        return single_run.answer(job.request)
-    except (RunFailed, GsoptError) as error:
-        return {"failed": str(error)}
+        worker = ForkWorker()
+        try:
+            for job in jobs:
+                outcome = worker.do(job, job.request)
+                print(outcome.output)
+                yield outcome
+        finally:
+            worker.end()
 
 
 SYNTH_VIEWS = str(Path(__file__).resolve().parents[2] / "scripts" / "synth_views.py")
@@ -116,7 +145,14 @@ LOCAL_FARM = open_farm.open_farm
 KINDS = ("none", "kill", "fail once", "fail from here", "short")
 LONGEST_SECONDS = 900
 """A run takes seconds, or minutes on a machine with much else to do."""
-FULL = os.environ.get("GSOPT_EVERY_WRITE") == "full"
+IMPORTED_BY_JOBS = (
+    *("gsopt.cli.sfm", "gsopt.data.sfm.pipeline", "pycolmap", "gsopt.cli.bench", "gsopt.benchmark.suite.run_figures"),
+    *("gsopt.benchmark.suite.html_page", "gsopt.results.report.page", "gsopt.training.reconstruct"),
+    *("gsopt.raster.device.backend", "gsopt.shape_prior.completion", "gsopt.formats.compressed_ply"),
+    *("gsopt.training.guided.start", "gsopt.training.library_body", "gsopt.training.density.adc"),
+    "gsopt.data.sfm.reuse",
+)
+FULL = os.environ.get("GSOPT_EVERY_WRITE") in ("full", "all")
 
 
 def prepare() -> None:
@@ -127,10 +163,17 @@ def prepare() -> None:
         setattr(module, name, value)
     if FULL:
         view_conditioned.make_unet(0)  # imports diffusers, for seconds
-        importlib.import_module("gsopt.data.sfm.pipeline")
-        importlib.import_module("pycolmap")
+        for name in IMPORTED_BY_JOBS:
+            importlib.import_module(name)
+        Image.init()
+        train_flags._help = functools.cache(train_flags._help)  # reads the sources
+        train_flags.parse(["scene"])
+        evaluation.Lpips = functools.cache(evaluation.Lpips)  # type: ignore[attr-defined]
+        evaluation.networks()
         open_farm.open_farm = lambda *_: ForkFarm()
-        child_process.subprocess = SimpleNamespace(**{**vars(subprocess), "Popen": ForkedChild})
+        child_process.subprocess = FORKING  # type: ignore[assignment]
+        single_run.Worker = ForkWorker  # type: ignore[misc]
+    gc.freeze()  # so that a fork copies fewer pages
 
 
 def run(job: dict[str, Any], faults: ctypes.CDLL) -> NoReturn:
@@ -154,7 +197,7 @@ def program(arguments: list[str]) -> int:
     return int(synth_views.main(arguments))
 
 
-def serve() -> None:
+def run_jobs() -> None:
     faults = ctypes.CDLL(os.environ["LD_PRELOAD"])
     faults.faults_calls.restype = ctypes.c_long
     prepare()
@@ -170,4 +213,4 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
-    serve()
+    run_jobs()

@@ -71,6 +71,16 @@ def report(path: Path) -> object:
     return write_report(path.parent)
 
 
+def report_of_parts(path: Path) -> object:
+    """This target writes a report whose guidance, library, shape prior and poses are all described by its input."""
+    run = path.parent / "run"
+    for part in ("guidance/summary.json", "library/summary.json", "shape_prior/summary.json", "poses.json"):
+        (run / part).parent.mkdir(parents=True, exist_ok=True)
+        (run / part).write_bytes(path.read_bytes())
+    (run / "config.json").write_bytes(SHORT_CONFIG)
+    return write_report(run)
+
+
 def follow(path: Path) -> object:
     """This target does what the panel does with the events of a run."""
     return Follower(path.parent).poll()
@@ -143,7 +153,25 @@ EVENTS = (
     '{"v": 1, "seq": 2, "kind": "preview", "step": 5, "path": "previews/step_000005.ply"}\n'
     '{"v": 1, "seq": 3, "kind": "done", "step": 30, "n": 5, "seconds": 1.0}\n'
 )
-METRICS = '{"protocol": {}, "mean": {"psnr": 20.0}, "views": [{"name": "a.png", "psnr": 20.0}]}'
+METRICS = (
+    '{"protocol": {}, "mean": {"psnr": 20.0}, "views": [{"name": "a.png", "psnr": 20.0}]}',
+    '{"mean": {"psnr": 20.0, "lpips_vgg": null}, "per_view": [{"name": "a", "psnr": 9}], "notes": ["b"], '
+    '"reason": "c", "protocol": "d", "n_gaussians": 5, "steps": 30, "train_seconds": 1.5, "peak_memory_mb": 300}',
+    '{"train": {"mean": {"psnr": 20}, "per_view": [{"name": "a", "ssim": 0.9}]}}',
+)
+TROUBLE = (
+    '{"v": 1, "seq": 0, "kind": "progress", "step": 9, "seconds": 2.0, "loss": 0.2, "n": 5}\n'
+    '{"v": 1, "seq": 1, "kind": "progress", "step": 3, "seconds": null, "loss": 0.1, "psnr": 20.0}\n'
+    '{"v": 1, "seq": 2, "kind": "warning", "message": "slow"}\n{"v": 1, "seq": 3, "kind": "error", "message": "no"}\n'
+)
+PARTS = (
+    '{"guided": 3, "wanted": 4, "decided": 1, "failed": 1, "ended": true, "model": "a", "policy": "b", '
+    '"lambda_sds": 0.1, "guard": {"factor": 0.5, "reason": "c"}, "views": [0], '
+    '"samples": [{"step": 5, "text": "a chair"}]}',
+    '{"views": [{"turned_degrees": 0.5}, {"turned_degrees": 1}], "texts": ["a chair"], "entries": 7, "library": "a", '
+    '"shapes": [{"name": "a", "id": "b", "share": 0.5, "agreement": 0.9, "words": 1, "creator": "c", "license": "d"}]}',
+    '{"words": ["chair"], "unknown_words": ["chaise"], "prior": "a", "digest": "b"}',
+)
 JOB = json.dumps(
     {
         "version": job.VERSION,
@@ -166,6 +194,8 @@ POINTS = "# points\n1 0 0 0 255 0 0 0.5 1 0\n"
 SUITE = (Path(definition.__file__).parent.parent / "suites" / "smoke.toml").read_text(encoding="utf-8")
 
 CONFIG = json.dumps({"config": TrainConfig().to_dict()}).encode()
+SHORT_CONFIG = b'{"config": {}}'
+RECORDED = '{"config": {}, "gaussians_init": 5, "symmetry": [{"about": "a"}], "versions": {"gsopt": "1"}, "seeds": {}}'
 
 TARGETS = {
     **{f"splats{suffix}": Target(f"a{suffix}", reads_or_refuses, saved(suffix)) for suffix in SUFFIXES},
@@ -186,8 +216,12 @@ TARGETS = {
     "points3D.bin": Target("points3D.bin", clear(colmap_files.read_points), texts("\1" + "\0" * 80)),
     "config.json": Target("config.json", clear(TrainConfig.read), lambda folder: [CONFIG]),
     "events.jsonl": Target("events.jsonl", clear(read_events), texts(EVENTS)),
-    "report of metrics.json": Target("metrics.json", clear(report), texts(METRICS), {"config.json": CONFIG}),
-    "report of events.jsonl": Target("events.jsonl", clear(report), texts(EVENTS), {"config.json": CONFIG}),
+    "report of metrics.json": Target("metrics.json", clear(report), texts(*METRICS), {"config.json": SHORT_CONFIG}),
+    "report of events.jsonl": Target(
+        "events.jsonl", clear(report), texts(EVENTS, TROUBLE), {"config.json": SHORT_CONFIG}
+    ),
+    "report of config.json": Target("config.json", clear(report), texts(RECORDED)),
+    "report of parts": Target("parts.json", clear(report_of_parts), texts(*PARTS)),
     "checkpoint": Target("step_000001.safetensors", clear(read_checkpoint), checkpoint),
     "prompts.json": Target("prompts.json", clear(read_set), prompt_file),
     "reply": Target("reply.txt", never_raises, texts(REPLY)),

@@ -149,6 +149,16 @@ def test_one_view_decides_nothing() -> None:
     assert residuals(1, dependent=True).ratio() == 0
 
 
+def test_residuals_without_any_scatter_decide_nothing() -> None:
+    """One camera twice, with the same gradient: chance explains nothing, and nothing is divided by it."""
+    gaussians, cameras = cloud(5, seed=1), ring(2, 1.0).to(torch.float32)
+    bands, nothing = Bands(every=2, highest=3), torch.zeros(5, 1, 3)
+    for _ in range(2):
+        v = Gradients(nothing, nothing, nothing, nothing, torch.ones(5, 1, 3), nothing, nothing, None)
+        bands.note(gaussians, cameras[0], v)
+    assert bands.ratio() == 0
+
+
 def test_bands_are_watched_just_before_they_are_due() -> None:
     bands = Bands(every=1000, highest=1)
     assert [bands.watches(step) for step in (1, 900, 901, 1000, 1001)] == [False, False, True, True, False]

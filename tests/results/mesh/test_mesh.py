@@ -194,6 +194,15 @@ def test_floaters_and_hollows_are_left_out() -> None:
     assert float(tidy[1, 1, 1]) > 0
 
 
+def test_a_floater_that_only_cells_of_zero_join_is_left_out() -> None:
+    """Zero is outside: no surface lies between the floater and the object."""
+    field = torch.ones(24, 24, 24)
+    field[8:20, 8:20, 8:20] = -1
+    field[3:8, 10, 10] = 0
+    field[2, 10, 10] = -1
+    assert float(surface.tidied(field)[2, 10, 10]) > 0
+
+
 def test_sheets_that_touch_are_taken_apart_and_folded_faces_go() -> None:
     """Two pyramids that share an edge, and a flap: four faces along one edge before, two along every edge after."""
     first = pyramid().faces.numpy()
