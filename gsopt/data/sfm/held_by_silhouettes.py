@@ -56,8 +56,7 @@ def held_by_silhouettes(
     if found is None:
         return reconstruction, []
     if found.contradicted:
-        wrong = [_name(views[number]) for number in contradicting(views)]
-        numbers = {number for number in reconstruction.reg_image_ids() if reconstruction.image(number).name in wrong}
+        wrong, numbers = _wrong(reconstruction, views)
         if not wrong:
             return reconstruction if found.after < REFUTED else None, [CONTRADICTION.format(found.before)]
         if not loosely_held(reconstruction, numbers):
@@ -70,11 +69,21 @@ def held_by_silhouettes(
 
 
 def outline_misses(reconstruction: Any, inputs: FeatureInput, folder: Path) -> float | None:
-    """Misses of the outlines with the best poses near those of a reconstruction, px, or None where a photo has no
-    outline."""
+    """Misses of the outlines with the best poses near those of a reconstruction, px, without the photos that will be
+    left out, or None where a photo has no outline."""
     views = _views(reconstruction, inputs, folder)
     found = coherent_poses(views) if views else None
+    if found is not None and found.contradicted:
+        wrong, numbers = _wrong(reconstruction, views)
+        if wrong and loosely_held(reconstruction, numbers):
+            found = coherent_poses([view for view in views if _name(view) not in wrong])
     return None if found is None else found.after
+
+
+def _wrong(reconstruction: Any, views: Sequence[View]) -> tuple[list[str], set[int]]:
+    """Names and numbers of the photos whose outlines contradict all others."""
+    wrong = [_name(views[number]) for number in contradicting(views)]
+    return wrong, {number for number in reconstruction.reg_image_ids() if reconstruction.image(number).name in wrong}
 
 
 def _views(reconstruction: Any, inputs: FeatureInput, folder: Path) -> tuple[View, ...]:

@@ -260,6 +260,10 @@ def test_misses_of_a_reconstruction_are_those_of_the_best_poses_near_it(work: Pa
     assert 0 < outline_misses(near, inputs, folder) < 0.5
     wrong = misplaced(views, (0, 2, 4, 6))
     assert outline_misses(reconstruction(pycolmap, wrong, wrong, names), inputs, folder) > REFUTED
+    one = misplaced(views, (2,))
+    for share, left_out in ((0.1, True), (0.9, False)):
+        made = with_points_seen(reconstruction(pycolmap, one, one, names), 3, share)
+        assert (outline_misses(made, inputs, folder) < COHERENT) == left_out
     assert outline_misses(near, replace(inputs, unmasked=[names[1]]), folder) is None
     assert outline_misses(near, replace(inputs, masks=None), folder) is None
 
