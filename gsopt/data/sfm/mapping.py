@@ -25,7 +25,7 @@ INCREMENTAL_UP_TO = 300
 ENOUGH_PLACED = 0.9
 """Share of the photos below which `auto` tries the other mapper."""
 HELD = "held-lens"
-"""The mapper that `auto` tries second, of more photos than a few."""
+"""The mapper that `auto` tries where another one leaves out many of more photos than a few."""
 SMALLEST_MODEL = 3
 MIN_SHARED_POINTS = 15
 """Points a photo must share with another one for its pose to count."""
