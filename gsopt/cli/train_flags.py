@@ -126,7 +126,7 @@ def _settings_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
         hint, default = _flag_type(name, hints[item.name]), getattr(info.default, item.name)
         if name == "iterations":  # given ones hold for few views too, those of a preset do not
             hint, default = Annotated[int | None, *typing.get_args(hint)[1:]], None
-        flags.append(StructFieldSpec(item.name, hint, default, functools.partial(_help, info.type, item.name)))
+        flags.append(StructFieldSpec(item.name, hint, default, functools.partial(_docstrings(info.type).get, item.name)))
     return StructConstructorSpec(TrainConfig.of if info.type is TrainConfig else info.type, tuple(flags))
 
 
@@ -156,10 +156,12 @@ def _view_ids() -> PrimitiveConstructorSpec[Any]:
     )
 
 
-def _help(cls: type, name: str) -> str | None:
-    """The docstring of a field, on one line."""
+@functools.cache
+def _docstrings(cls: type) -> dict[str, str]:
+    """The docstring of each field, on one line."""
     body = ast.parse(inspect.getsource(cls)).body[0].body  # type: ignore[attr-defined]
-    for node, text in itertools.pairwise(body):
-        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == name and isinstance(text, ast.Expr):
-            return " ".join(ast.literal_eval(text.value).split())
-    return None
+    return {
+        ast.unparse(node.target): " ".join(ast.literal_eval(text.value).split())
+        for node, text in itertools.pairwise(body)
+        if isinstance(node, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
