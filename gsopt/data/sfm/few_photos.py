@@ -24,6 +24,7 @@ from gsopt.data.sfm.mapping import (
     SMALLEST_MODEL,
     MappingResult,
     bundle_adjusted,
+    has_real_lens,
     incremental_options,
     keep_coherent,
     registered,
@@ -126,8 +127,8 @@ def find_few_poses(
     if found.num_reg_images() < count:
         found = _grown(project, pairs, found)
     keep_coherent(found)
-    enough = found.num_reg_images() >= SMALLEST_MODEL
-    return (MappingResult(found, "few photos", []) if enough else None), graph
+    sound = found.num_reg_images() >= SMALLEST_MODEL and has_real_lens(project, found, report)
+    return (MappingResult(found, "few photos", []) if sound else None), graph
 
 
 def observations(reconstruction: Any) -> int:
@@ -224,7 +225,7 @@ def verify(
             )
             if db.exists_two_view_geometry(a, b):
                 db.delete_two_view_geometry(a, b)
-            if len(found.inlier_matches) >= MIN_INLIERS:
+            if len(found.inlier_matches) >= MIN_INLIERS and found.cam2_from_cam1 is not None:
                 db.write_two_view_geometry(a, b, found)
                 counts[a, b] = len(found.inlier_matches)
                 turns[a, b] = found.cam2_from_cam1.rotation.matrix()

@@ -45,6 +45,11 @@ MAX_OFF_CENTER = 0.03
 shift of all photos looks like a turn of all cameras: 13 % and 5 degrees on a rendered orbit."""
 
 
+LENSES = (0.25, 5.0)
+"""Shortest and longest focal length that is believed where EXIF names none, in longer sides of the photo: a fisheye's,
+a telephoto's. Wrong matches make it grow without end: 10 and 33 where the camera had 0.75."""
+
+
 @dataclass(frozen=True)
 class MappingResult:
     """The largest reconstruction that was found."""
@@ -90,7 +95,20 @@ def find_poses(project: ColmapProject, graph: ViewGraph, report: Report) -> Mapp
         best = replace(best, reconstruction=_settled(project, best.reconstruction))
     best = replace(best, reconstruction=adjusted(project, best.reconstruction))
     keep_coherent(best.reconstruction)
-    return best if len(best.names) >= SMALLEST_MODEL else None
+    sound = len(best.names) >= SMALLEST_MODEL and has_real_lens(project, best.reconstruction, report)
+    return best if sound else None
+
+
+def has_real_lens(project: ColmapProject, reconstruction: Any, report: Report) -> bool:
+    """True where the focal lengths are known, or such as cameras have."""
+    if project.config.focal is not None:
+        return True
+    for camera in reconstruction.cameras.values():
+        sides = camera.mean_focal_length() / max(camera.width, camera.height)
+        if not camera.has_prior_focal_length and not LENSES[0] <= sides <= LENSES[1]:
+            report(f"no camera has the lens that these poses need: a focal length of {sides:.2g} sides of the photo")
+            return False
+    return True
 
 
 def mappers_to_try(config: SfmConfig, count: int) -> list[str]:

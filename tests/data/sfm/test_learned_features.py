@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +18,14 @@ import textured_room as room
 from PIL import Image
 
 from gsopt.cli import main
-from gsopt.data.sfm import pipeline
+from gsopt.data.sfm import pose_search
 from gsopt.data.sfm.features import ColmapProject, extract
 from gsopt.data.sfm.joined_features import PARTNERS, alike, join, joined_matches, learned_matches, match_joined
 from gsopt.data.sfm.learned_features import LearnedFeatures, LearnedMatcher, lookalikes
-from gsopt.data.sfm.photos import Photo, find_photos, read_photos
+from gsopt.data.sfm.photos import find_photos, read_photos
+from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.stage_times import StageTimes
 from gsopt.errors import InputError, MissingDependency, UsageError
 
 COUNT = 40
@@ -58,6 +60,14 @@ def project(folder: Path, features: str) -> tuple[ColmapProject, list[str]]:
     made = ColmapProject(pycolmap, folder / "work" / "database.db", folder / "work" / "photos", config)
     extract(made, photos, None)
     return made, [photo.name for photo in photos]
+
+
+def search(work: Path, count: int, *, video: bool = False, **settings: Any) -> PoseSearch:
+    """A search for the poses of so many photos without masks."""
+    photos: Any = [SimpleNamespace(name=f"{i}.png") for i in range(count)]
+    inputs: Any = SimpleNamespace(kind="none", masks=None, photos=work)
+    where = (pycolmap, work, SfmConfig(**settings), photos, inputs)
+    return PoseSearch(*where, StageTimes(), lambda line: None, video=video)
 
 
 def learned_of(made: ColmapProject, names: list[str], masks: Path | None = None, threads: int = 1) -> Any:
@@ -162,11 +172,9 @@ def test_few_photos_get_learned_features_too_where_they_are_installed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(pipeline, "find_spec", lambda name: object() if installed else None)
-    (tmp_path / source).touch()
-    run = pipeline._Run(pycolmap, tmp_path / source, tmp_path, SfmConfig(**settings), lambda line: None)
-    photos = [cast("Photo", object())] * count
-    assert run._chosen_features(photos) == want
+    monkeypatch.setattr(pose_search, "find_spec", lambda name: object() if installed else None)
+    run = search(tmp_path, count, video=source.endswith(".mp4"), **settings)
+    assert run._chosen_features() == want
 
 
 @pytest.mark.parametrize(
@@ -194,11 +202,10 @@ def test_many_photos_get_learned_features_where_sift_leaves_out_more_than_a_tent
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(pipeline, "find_spec", lambda name: object() if installed else None)
-    (tmp_path / source).touch()
-    run = pipeline._Run(pycolmap, tmp_path / source, tmp_path, SfmConfig(**settings), lambda line: None)
+    monkeypatch.setattr(pose_search, "find_spec", lambda name: object() if installed else None)
     mapped: Any = None if placed is None else SimpleNamespace(names=range(placed))
-    assert run._wants_learned([cast("Photo", object())] * count, mapped) == want
+    run = search(tmp_path, count, video=source.endswith(".mp4"), **settings)
+    assert run._wants_learned(mapped) == want
 
 
 @pytest.mark.parametrize(("first", "second", "kept"), [(4, 5, True), (None, 3, True), (4, 4, False), (4, None, False)])
@@ -206,24 +213,24 @@ def test_what_places_more_photos_is_kept(
     first: int | None, second: int | None, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second look has a database of its own, and the record says which features were used."""
-    made, _ = project(tmp_path / "photos", "sift")
-    run = pipeline._Run(pycolmap, tmp_path, tmp_path, SfmConfig(features="sift"), lambda line: None)
+    run = search(tmp_path, 20)
     graphs: list[str] = []
     mapped, again = (None if count is None else SimpleNamespace(names=range(count)) for count in (first, second))
 
-    def graph(project: ColmapProject, *_: Any) -> tuple[Any, str]:
-        assert (run.config.features, project.config.features) == ("both", "both")
+    def graph(project: ColmapProject, frames: object = None) -> str:
+        assert project.config.features == "both"
         assert project.database.parent.is_dir()
-        assert project.database.parent != made.database.parent
+        assert project.database.parent != tmp_path
         graphs.append("again")
-        return "again", "exhaustive"
+        return "again"
 
     monkeypatch.setattr(run, "_graph", graph)
-    monkeypatch.setattr(run, "_mapped", lambda project, graph, frames: again)
-    found: Any = run._learned(made, [], cast("Any", None), cast("Any", "first"), cast("Any", mapped))
+    monkeypatch.setattr(run, "_mapped", lambda project, graph: again)
+    found: Any = run._with_learned(FoundPoses("first", mapped, "sift"))  # type: ignore[arg-type]
     assert graphs == ["again"]
-    assert found == (("again", again) if kept else ("first", mapped))
-    assert run.config.features == ("both" if kept else "sift")
+    assert (found.graph, found.mapped, found.features) == (
+        ("again", again, "both") if kept else ("first", mapped, "sift")
+    )
 
 
 @pytest.mark.parametrize("name", ["orb", "SIFT", ""])

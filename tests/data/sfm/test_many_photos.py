@@ -9,7 +9,7 @@ import pytest
 
 from gsopt.data.sfm import features
 from gsopt.data.sfm.features import EXHAUSTIVE_UP_TO, choose_matching
-from gsopt.data.sfm.pipeline import _Run
+from gsopt.data.sfm.pose_search import PoseSearch
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.errors import UsageError
 
@@ -51,6 +51,6 @@ def test_comparing_200_photos_says_how_long_it_takes(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("matching", ["retrieval", "sequential"])
 def test_learned_features_for_a_video_or_too_many_photos_are_refused(matching: str) -> None:
-    run = SimpleNamespace(config=SfmConfig(features="both"))
+    run = SimpleNamespace(config=SfmConfig(features="both"), matching=matching)
     with pytest.raises(UsageError, match=f"compares all photos with all, which {EXHAUSTIVE_UP_TO}"):
-        _Run._matcher(run, matching)  # type: ignore[arg-type]
+        PoseSearch._matcher(run)  # type: ignore[arg-type]

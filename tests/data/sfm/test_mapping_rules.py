@@ -36,6 +36,10 @@ class Reconstruction:
             if len(seen) > 1
         }
 
+    @property
+    def cameras(self) -> dict[int, Any]:
+        return {1: lens(0.75)}
+
     def reg_image_ids(self) -> list[int]:
         return sorted(self.photos)
 
@@ -48,6 +52,11 @@ class Reconstruction:
 
     def deregister_frame(self, frame: int) -> None:
         self.photos.remove(frame - 100)
+
+
+def lens(sides: float, *, known: bool = False) -> Any:
+    """A camera with a focal length of so many longer sides of its photos."""
+    return SimpleNamespace(width=300, height=400, mean_focal_length=lambda: 400 * sides, has_prior_focal_length=known)
 
 
 def shared(count: int, *photos: int, error: float = 0.5) -> list[tuple[list[int], float]]:
@@ -171,6 +180,32 @@ def test_another_mapper_is_tried_where_less_than_nine_tenths_are_placed(
     assert found is not None
     assert (found.mapper, found.names) == ("incremental", {f"{i}.jpg" for i in range(1, first + 1)})
     assert found.others == [{f"{first + 1}.jpg"}]
+
+
+@pytest.mark.parametrize(
+    ("sides", "known", "focal", "real"),
+    [
+        (0.25, False, None, True),
+        (0.24, False, None, False),
+        (5.0, False, None, True),
+        (5.1, False, None, False),
+        (33.0, False, None, False),
+        (33.0, True, None, True),
+        (33.0, False, 13200.0, True),
+    ],
+)
+def test_poses_that_need_a_lens_which_no_camera_has_are_given_up(
+    sides: float, known: bool, focal: float | None, real: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that EXIF or the user names is believed."""
+    monkeypatch.setattr(Reconstruction, "cameras", {1: lens(0.75), 2: lens(sides, known=known)})
+    chain = [point for i in range(1, 6) for point in shared(20, i, i + 1)]
+    monkeypatch.setattr(mapping, "run_mapper", lambda *_: [Reconstruction([1, 2, 3, 4, 5, 6], chain)])
+    monkeypatch.setattr(mapping, "adjusted", lambda project, model: model)
+    project: Any = SimpleNamespace(config=SfmConfig(mapper="incremental", focal=focal))
+    lines: list[str] = []
+    assert (mapping.find_poses(project, graph(CHAIN), lines.append) is not None) == real
+    assert [f"{sides:.2g} sides" in line for line in lines[1:]] == ([] if real else [True])
 
 
 def test_two_photos_are_no_reconstruction(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,11 +367,11 @@ class Pairs:
 def test_pairs_are_kept_with_enough_in_common_and_where_their_turn_agrees(
     features: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """17 of 18 features do not suffice; of learned features a pair that turns otherwise goes again."""
-    counts = {(1, 2): 18, (1, 3): 30, (2, 3): 17}
+    """17 of 18 features do not suffice, nor do 99 without a pose; of learned ones a pair that turns otherwise goes."""
+    counts = {(1, 2): 18, (1, 3): 30, (2, 3): 17, (3, 1): 99}
 
     def geometry(first: Any, points: Any, second: Any, others: Any, rows: Any, options: Any) -> Any:
-        pose = SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: "turn"))
+        pose = None if len(rows) == 99 else SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: "turn"))
         return SimpleNamespace(inlier_matches=rows[: options.min_num_inliers + 12], cam2_from_cam1=pose)
 
     options = SimpleNamespace(ransac=SimpleNamespace())

@@ -10,10 +10,20 @@ import numpy as np
 import pytest
 from test_answers import CHAIN, graph
 
-from gsopt.data.sfm import few_photos, known_poses, mapping, pipeline
-from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm import few_photos, known_poses, mapping, pose_search
 from gsopt.data.sfm.mapping import MappingResult
+from gsopt.data.sfm.photo_agreement import Agreement
+from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.stage_times import StageTimes
+
+
+def search(work: Path, count: int, **settings: Any) -> PoseSearch:
+    """A search for the poses of so many photos without masks."""
+    inputs: Any = SimpleNamespace(kind="none", masks=None, photos=work)
+    photos: Any = [SimpleNamespace(name=f"{i}.png") for i in range(count)]
+    pycolmap: Any = SimpleNamespace()
+    return PoseSearch(pycolmap, work, SfmConfig(**settings), photos, inputs, StageTimes(), lambda line: None)
 
 
 @pytest.mark.parametrize("posed", [False, True])
@@ -21,7 +31,7 @@ def test_three_photos_are_enough_for_a_reconstruction(posed: bool, monkeypatch: 
     found = MappingResult(SimpleNamespace(), "found", [])
     monkeypatch.setattr(mapping, "find_poses", lambda *_: found)
     monkeypatch.setattr(known_poses, "triangulate", lambda *_: found.reconstruction)
-    run = pipeline._Run(SimpleNamespace(), Path(), Path(), SfmConfig(), print)  # type: ignore[arg-type]
+    run = search(Path(), 5)
     for photos in range(5):
         view_graph = SimpleNamespace(features=dict.fromkeys(range(photos), 900))
         mapped = run._mapped(SimpleNamespace(), view_graph, [] if posed else None)  # type: ignore[arg-type]
@@ -75,16 +85,15 @@ def test_points_seen_from_one_side_or_far_from_their_pixels_are_left_out(off: fl
 def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     looks: list[bool] = []
     monkeypatch.setattr(
-        pipeline.features, "extract", lambda project, photos, masks, thorough=False: looks.append(thorough)
+        pose_search.features, "extract", lambda project, photos, masks, thorough=False: looks.append(thorough)
     )
     nothing = SimpleNamespace(matches=[], turntable=False)
     monkeypatch.setattr(few_photos, "trust", lambda *_: 0)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: nothing)
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, "another graph"))
-    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
-    project: Any = ColmapProject(SimpleNamespace(), tmp_path / "database.db", tmp_path, SfmConfig())  # type: ignore[arg-type]
-    inputs: Any = SimpleNamespace(kind="none", masks=None)
-    assert run._few(project, [], inputs, graph(CHAIN), None) == ("another graph", None)
+    run = search(tmp_path, 0)
+    first = FoundPoses(graph(CHAIN), None, "sift")
+    assert run._few(run._project(tmp_path, "sift"), first) == FoundPoses("another graph", None, "sift")  # type: ignore[arg-type]
     assert looks == [True]
 
 
@@ -96,19 +105,20 @@ def second_look(
     misses: tuple[float | None, float | None] = (None, None),
 ) -> bool:
     """True where six photos are looked at twice and the second result is taken; photos placed and misses by look."""
-    looks = [None if n is None else SimpleNamespace(names=[""] * n, reconstruction=row) for row, n in enumerate(placed)]
-    monkeypatch.setattr(pipeline.features, "extract", lambda *_, **__: None)
-    monkeypatch.setattr(pipeline, "outline_misses", lambda reconstruction, *_: misses[reconstruction])
+    looks: list[Any] = [
+        None if n is None else SimpleNamespace(names=[""] * n, reconstruction=row) for row, n in enumerate(placed)
+    ]
+    monkeypatch.setattr(pose_search.features, "extract", lambda *_, **__: None)
+    monkeypatch.setattr(pose_search, "outline_misses", lambda reconstruction, *_: misses[reconstruction])
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (looks[1], "another graph"))
-    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
-    project: Any = ColmapProject(SimpleNamespace(), tmp_path / "database.db", tmp_path, SfmConfig())  # type: ignore[arg-type]
-    inputs: Any = SimpleNamespace(kind="none", masks=None)
-    found: Any = run._few(project, [None] * 6, inputs, "graph", looks[0])  # type: ignore[list-item, arg-type]
-    taken = found[0] == "another graph"
-    assert found == (("another graph", looks[1]) if taken else ("graph", looks[0]))
-    assert len(run.notes) == int(taken)
+    run = search(tmp_path, 6)
+    first = FoundPoses("graph", looks[0], "both")  # type: ignore[arg-type]
+    found: Any = run._few(run._project(tmp_path, "both"), first)
+    taken = bool(found.graph == "another graph")
+    assert (found.graph, found.mapped) == (("another graph", looks[1]) if taken else ("graph", looks[0]))
+    assert (found.features, len(found.notes)) == ("both", int(taken))
     return taken
 
 
@@ -165,3 +175,34 @@ def test_the_largest_of_global_reconstructions_is_repaired_where_photos_are_miss
     placed = mapping.run_mapper(project, "hybrid", SimpleNamespace(features=dict.fromkeys(range(5), 9)))  # type: ignore[arg-type]
     assert bool(calls) == repaired
     assert [model.count for model in placed] == [count for count in found if count >= 3]
+
+
+@pytest.mark.parametrize(
+    ("features", "contradicted", "kept"),
+    [
+        ("auto", {}, "both"),
+        ("auto", {"both"}, "sift"),
+        ("auto", {"both", "sift"}, None),
+        ("both", {"both"}, None),
+        ("sift", {"sift"}, None),
+        ("sift", {}, "sift"),
+    ],
+)
+def test_poses_of_few_photos_that_contradict_them_are_sought_with_sift_alone_or_refused(
+    features: str, contradicted: set[str], kept: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """What the user has asked for is not replaced."""
+    run = search(tmp_path, 6, features=features)
+    monkeypatch.setattr(pose_search, "_learned_installed", lambda: True)
+    monkeypatch.setattr(run, "_graph", lambda project, frames=None: f"graph of {project.config.features}")
+    monkeypatch.setattr(
+        run, "_mapped", lambda project, *_: SimpleNamespace(reconstruction=project.config.features, names=["a"] * 6)
+    )
+    monkeypatch.setattr(run, "_looked_thoroughly", lambda project, found: found)
+    monkeypatch.setattr(
+        pose_search, "agreement", lambda reconstruction, photos: Agreement(9, 2 * (reconstruction in contradicted))
+    )
+    found = run.found(None)
+    assert (found.mapped and found.mapped.reconstruction) == kept
+    assert found.graph == f"graph of {kept or ('sift' if features == 'sift' else 'both')}"
+    assert ["2 of 9 times" in note for note in found.notes] == ([] if kept else [True])
