@@ -96,7 +96,7 @@ def measured(scene: Path, count: int, flags: list[str]) -> dict[str, Any]:
         photos, posed = Path(temporary, "photos"), Path(temporary, "posed")
         photos.mkdir()
         for number in (i * PHOTOS // count for i in range(count)):
-            with Image.open(scene / f"{number:02d}.png") as image:
+            with Image.open(scene / f"{number:02d}.png", formats=("PNG",)) as image:
                 image.convert("RGB").save(photos / f"{number:02d}.jpg", quality=JPEG_QUALITY)
         command = [sys.executable, "-m", "gsopt", "sfm", str(photos), "-o", str(posed), "--threads", "1", *flags]
         began = time.perf_counter()

@@ -1,9 +1,9 @@
 """Poses of few photos checked by what did NOT match: photos taken side by side must show the same things.
 
 Matches say where photos agree. A thing that looks alike from several sides (a lantern with six of them, a room with the
-same poster twice) matches itself turned, and poses follow that fit all of it. What surrounds the thing tells: a point
-that one photo shows lies in front of another one too, which by these poses was taken from nearly the same side, and
-there it looks otherwise. Compared is the patch of surface around the point, by the correlation of its gray values.
+same poster twice) matches itself turned, and poses follow that fit all of it. The surroundings tell: a point that one
+photo shows lies in front of another one too, which by these poses was taken from nearly the same side, and there
+something else is seen. The patches of surface around the point are compared, by the correlation of their gray values.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ class _Photo:
         local = xyz @ self.cam_from_world[:, :3].T + self.cam_from_world[:, 3]
         ahead = local[:, 2] > 0
         xy = np.full((len(xyz), 2), -1e6)
-        xy[ahead] = self.scale * np.nan_to_num(self.camera.img_from_cam(local[ahead]), nan=-1e6)
+        xy[ahead] = self.scale * self.camera.img_from_cam(local[ahead])
+        xy[~np.isfinite(xy)] = -1e6
         height, width = self.pixels.shape[1:]
         return xy, np.all((xy >= REACH) & (xy <= np.array([width, height]) - REACH), axis=1)
 

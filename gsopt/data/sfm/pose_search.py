@@ -46,7 +46,7 @@ class FoundPoses:
 
     graph: ViewGraph
     mapped: MappingResult | None
-    """None where no three photos could be placed, or where something refutes their poses."""
+    """Nothing where no three photos could be placed, or where something refutes their poses."""
     features: Features
     """The kind that was used."""
     notes: list[str] = field(default_factory=list)
