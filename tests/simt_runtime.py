@@ -25,19 +25,25 @@ SIMT = Path(__file__).with_name("simt.h")
 FLAGS = os.environ.get("GSOPT_SIMT_FLAGS", "-fsanitize=undefined -fno-sanitize-recover=undefined").split()
 
 
+def compiler() -> str:
+    """The path of the C++ compiler; a test that needs one is skipped where there is none."""
+    found = shutil.which(os.environ.get("CXX", "g++"))
+    if found is None:
+        pytest.skip("no C++ compiler")
+    return found
+
+
 @functools.cache
 def library() -> ctypes.CDLL:
     """The compiled kernels; every number that a kernel forgot to write is a pattern of bits."""
-    compiler = shutil.which(os.environ.get("CXX", "g++"))
-    if compiler is None:
-        pytest.skip("no C++ compiler")
+    cxx = compiler()
     with tempfile.TemporaryDirectory() as folder:
         source, built = Path(folder, "kernels.cpp"), Path(folder, "kernels.so")
         source.write_text(program(SIMT), encoding="utf-8")
         flags = ["-std=c++20", "-O1", "-g1", "-fPIC", "-shared", "-ftrivial-auto-var-init=pattern", *FLAGS]
         alone = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
         done = subprocess.run(
-            [compiler, *flags, "-Wall", "-Wextra", "-Werror", source, "-o", built], capture_output=True, env=alone
+            [cxx, *flags, "-Wall", "-Wextra", "-Werror", source, "-o", built], capture_output=True, env=alone
         )
         assert done.returncode == 0, done.stderr.decode()
         return ctypes.CDLL(str(built))

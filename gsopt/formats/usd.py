@@ -154,10 +154,14 @@ def _layer(path: Path) -> Any:
 
 def require_survivable(path: Path) -> None:
     """InputError where the library would end this process."""
-    probe = [sys.executable, "-P", str(_PROBE), str(path.absolute())]
-    done = subprocess.run(probe, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    if done.returncode not in (0, 1):
+    if probe_exit_code(path) not in (0, 1):
         raise InputError(f"{path} is no USD: the library that reads USD crashes over it. Copy or export it again.")
+
+
+def probe_exit_code(path: Path) -> int:
+    """The end of a process that reads the file first; negative for a signal."""
+    probe = [sys.executable, "-P", str(_PROBE), str(path.absolute())]
+    return subprocess.run(probe, stdin=subprocess.DEVNULL, capture_output=True, check=False).returncode
 
 
 def _read(prim: Any, means: Tensor, path: Path) -> Gaussians:

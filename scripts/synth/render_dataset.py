@@ -50,7 +50,7 @@ def run(
     header = {"version": VERSION, "settings": settings.record(), "seed": seed, "files_sha256": files_used(settings)}
     open_folder(out, header, resume)
     todo = [item for item in items if not (out / item.id / RECORD).is_file()]
-    failures = [failure for item in items if item not in todo for failure in changed(out, item)]
+    failures = [lost for item in items if item not in todo for lost in changed(out, item)]
     farm = farm or LocalFarm(max(1, settings.threads))
     report(f"{len(items)} objects, {len(items) - len(todo)} of them rendered before; {farm}")
     jobs = [

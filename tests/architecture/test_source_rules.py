@@ -6,6 +6,7 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import UnionType
 
 import pytest
 
@@ -17,6 +18,8 @@ CODE = {".py", ".cpp", ".h"}
 BANNED_MODULES = {"pickle", "cPickle", "dill", "joblib", "marshal", "shelve"}
 BANNED_CALLS = {"eval", "exec"}
 BANNED_ATTRIBUTES = {"nan_to_num", "nan_to_num_"}
+BINDERS = ast.Name | ast.arg
+INLINED = ast.ListComp | ast.SetComp | ast.DictComp
 ERRORS = {name for name, thing in vars(gsopt.errors).items() if isinstance(thing, type)}
 # Raised by protocol of the language, not by mistake: __getattr__ and the way out of a program.
 OTHER_RAISES = {"AttributeError", "SystemExit", "KeyboardInterrupt"}
@@ -68,6 +71,37 @@ def any_format(tree: ast.Module) -> Iterator[str]:
             formats = [keyword.value for keyword in node.keywords if keyword.arg == "formats"]
             if not formats or ast.unparse(formats[0]) == "None":
                 yield ast.unparse(node)
+
+
+def two_meanings(tree: ast.Module) -> Iterator[str]:
+    """Names that one comprehension of a function binds and another takes from outside: CPython 3.12.1 mixes them up."""
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            found = list(outermost(function, INLINED))
+            inside = {id(node) for comprehension in found for node in ast.walk(comprehension)}
+            kept = {id(node.target) for node in ast.walk(function) if isinstance(node, ast.NamedExpr)}
+            outside = [node for node in ast.walk(function) if id(node) not in inside - kept]
+            own = {node.id if isinstance(node, ast.Name) else node.arg for node in outside if isinstance(node, BINDERS)}
+            bound = [names_of(*bindings_in(comprehension)) for comprehension in found]
+            free = [names_of(comprehension) - names for comprehension, names in zip(found, bound, strict=True)]
+            yield from sorted(set().union(*bound) & set().union(*free) - own)
+
+
+def outermost(node: ast.AST, kinds: type | UnionType) -> Iterator[ast.AST]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, kinds):
+            yield child
+        else:
+            yield from outermost(child, kinds)
+
+
+def names_of(*nodes: ast.AST) -> set[str]:
+    return {name.id for node in nodes for name in ast.walk(node) if isinstance(name, ast.Name)}
+
+
+def bindings_in(node: ast.AST) -> Iterator[ast.expr]:
+    """What the comprehensions of an expression bind."""
+    return (inner.target for inner in ast.walk(node) if isinstance(inner, ast.comprehension))
 
 
 def message(call: ast.Call) -> str | None:
@@ -142,7 +176,7 @@ def test_no_function_is_longer_than_forty_statements(root: Path, tracked: list[P
     assert found_in([file for file in tracked if file.suffix == ".py"], root, long_functions) == []
 
 
-@pytest.mark.parametrize("rule", [banned, any_format, curt_messages], ids=lambda rule: rule.__name__)
+@pytest.mark.parametrize("rule", [banned, any_format, curt_messages, two_meanings], ids=lambda rule: rule.__name__)
 def test_shipped_python_keeps_the_rule(root: Path, tracked: list[Path], rule) -> None:
     assert found_in(shipped(root, tracked), root, rule) == []
 
@@ -167,6 +201,8 @@ def test_gsopt_raises_its_own_errors(root: Path, tracked: list[Path]) -> None:
         (curt_messages, "raise InputError(f'Bad value, got {x}.')"),
         (foreign_raises, "def public():\n    raise ValueError('x')"),
         (foreign_raises, "try:\n    raise ValueError('x')\nexcept OSError:\n    pass"),
+        (two_meanings, "def f(a):\n    return [x for x in a], [x(y) for y in a]"),
+        (two_meanings, "def f(a):\n    b = {x for x in a}\n    return {y: x for y in b}"),
         (long_functions, "def f():\n" + "    x = 1\n" * 41),
     ],
 )
@@ -186,6 +222,12 @@ def test_a_rule_notices_what_breaks_it(rule, source: str) -> None:
             foreign_raises,
             "try:\n    raise ValueError('x')\nexcept (OSError, ValueError) as e:\n    raise InputError() from e",
         ),
+        (two_meanings, "def f(a):\n    return [x for x in a], [x for x in a if x], list(x(y) for y in a)"),
+        (two_meanings, "def f(a):\n    for x in a:\n        g([x for x in a], [x(y) for y in a])"),
+        (two_meanings, "def f(a, x):\n    return [x for x in a], [x(y) for y in a]"),
+        (two_meanings, "def f(a):\n    return [[b(x, y) for y in a] for x in a]"),
+        (two_meanings, "def f(a):\n    b = [x for y in a if (x := y)]\n    return [x for x in b]"),
+        (two_meanings, "def f(a):\n    return [y(x) for x in [z for z in a]]"),
         (long_functions, "def f():\n    '''Doc.'''\n" + "    x = 1\n" * 40),
     ],
 )

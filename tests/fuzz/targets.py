@@ -13,6 +13,8 @@ from pathlib import Path
 from ksplat_files import ksplat
 from splat_laws import reads_or_refuses, require_short
 from tiny_scenes import cloud, write_dataset
+from usd_forks import in_forks
+from usd_seeds import usd_binaries, usd_texts
 
 from blender_addon.core import cameras, colmap, job, ply, spz
 from blender_addon.core import prompts as panel_prompts
@@ -24,6 +26,7 @@ from gsopt.data import colmap_files, pointcloud, transforms
 from gsopt.errors import GsoptError
 from gsopt.events import read_events
 from gsopt.formats import SUFFIXES, save_splats
+from gsopt.formats.units import read_units
 from gsopt.llm_prompts.expand import PromptSpec
 from gsopt.llm_prompts.reply import read_reply
 from gsopt.llm_prompts.tokens import ESTIMATED_COUNTER
@@ -84,6 +87,13 @@ def report_of_parts(path: Path) -> object:
 def follow(path: Path) -> object:
     """This target does what the panel does with the events of a run."""
     return Follower(path.parent).poll()
+
+
+def usd(path: Path) -> None:
+    """The law of splats and the law of readers for the notes of a layer."""
+    with in_forks():
+        reads_or_refuses(path)
+        clear(read_units)(path)
 
 
 def padded_ksplat(path: Path) -> None:
@@ -199,6 +209,8 @@ RECORDED = '{"config": {}, "gaussians_init": 5, "symmetry": [{"about": "a"}], "v
 
 TARGETS = {
     **{f"splats{suffix}": Target(f"a{suffix}", reads_or_refuses, saved(suffix)) for suffix in SUFFIXES},
+    "splats.usda": Target("a.usda", usd, lambda folder: saved(".usda")(folder) + usd_texts(folder)),
+    "splats.usdc": Target("a.usdc", usd, lambda folder: saved(".usdc")(folder) + usd_binaries(folder)),
     "sog meta.json": in_a_sog("meta.json"),
     "sog means": in_a_sog("means_l.webp"),
     "splats.ksplat": Target("short.ksplat", padded_ksplat, short_ksplats),

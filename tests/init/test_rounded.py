@@ -120,3 +120,10 @@ def test_a_point_on_the_border_shares_the_last_of_wide_pixels() -> None:
     photo = Thumbnail(Cameras(torch.eye(4)[None], K, 100, 100), torch.full((4, 100, 100), 255, dtype=torch.uint8))
     points = torch.tensor([[0.5, 0.1, 1.0], [0.49, 0.1, 1.0], [0.1, 0.5, 1.0], [0.1, 0.49, 1.0]])
     assert thickest(photo, points, 0.02, torch.tensor([1.0, 2, 3, 4])).tolist() == [2, 2, 4, 4]
+
+
+def test_the_last_pixel_is_not_the_one_before() -> None:
+    K = torch.tensor([[[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]])
+    photo = Thumbnail(Cameras(torch.eye(4)[None], K, 100, 100), torch.full((4, 100, 100), 255, dtype=torch.uint8))
+    points = torch.tensor([[0.495, 0.1, 1.0], [0.485, 0.1, 1.0], [0.1, 0.495, 1.0], [0.1, 0.485, 1.0]])
+    assert thickest(photo, points, 0.001, torch.tensor([1.0, 2, 3, 4])).tolist() == [1, 2, 3, 4]

@@ -119,6 +119,8 @@ def test_a_known_length_gives_the_run_its_scale_and_exports_carry_it(tmp_path: P
         (["--from", "1,2", "--to", "1,2,3"], 2, "X,Y,Z"),
         (["--from", "absent@1,2", "--to", "1,2,3"], 2, "must name one view"),
         (["--from", "0,0,0", "--to", f"r_0@{WIDTH},{HEIGHT}"], 2, "inside it"),
+        (["--from", "0,0,0", "--to", f"r_0@1,{HEIGHT}"], 2, "inside it"),
+        (["--from", "0,0,0", "--to", f"r_0@{WIDTH},1"], 2, "inside it"),
         (["--from", "0,0,0", "--to", "r_0@0,0"], 2, "no surface"),
         (["--from", "0,0,0", "--to", "0,0,0", "--unit-length", "1m"], 2, "lie apart"),
         (["--from", "0,0,0", "--to", "0,0,1", "--unit-length", "1"], 2, "one of m, cm"),

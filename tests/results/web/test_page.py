@@ -22,12 +22,12 @@ import gsopt
 from gsopt.cli import main
 from gsopt.formats.spz import save_spz
 from gsopt.gaussians import Gaussians
-from gsopt.geometry.cameras import Cameras
+from gsopt.geometry.cameras import Cameras, look_at
 from gsopt.results.report import write_report
 from gsopt.results.web import page as web_page
 from gsopt.results.web import save_page, scene_of_splats
 from gsopt.results.web.payload import packed_splats, planes
-from gsopt.results.web.scene import framed
+from gsopt.results.web.scene import framed, pose
 
 EVIL = "</script><script>alert('x')</script><img src=x onerror=alert(1)>&\"'\u2028"
 
@@ -183,3 +183,15 @@ def test_a_report_of_many_splats_shows_a_turntable(run: Path, monkeypatch: pytes
     text = write_report(run).read_text(encoding="utf-8")
     assert Scripts(text).scripts == []
     assert "Turntable of the result" in text
+
+
+def test_the_page_gets_the_axes_of_a_camera_one_after_the_other() -> None:
+    """viewer.js takes right, down and forward as three numbers each."""
+    viewmats = look_at(torch.tensor([[3.0, 1.0, -2.0]]), torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    found = pose(Cameras(viewmats, torch.tensor([[[50.0, 0, 16], [0, 60, 12], [0, 0, 1]]]), 32, 24))
+    right, down, forward = (torch.tensor(found["axes"][3 * i : 3 * i + 3]) for i in range(3))
+    assert len(found["axes"]) == 9
+    eye = torch.tensor(found["eye"])
+    torch.testing.assert_close(forward, -eye / eye.norm(), rtol=0, atol=1e-4)  # rounded for the page
+    torch.testing.assert_close(torch.linalg.cross(right, down), forward, rtol=0, atol=1e-4)
+    assert found["lens"] == [50, 60, 16, 12, 32, 24]
