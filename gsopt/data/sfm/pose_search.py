@@ -1,7 +1,8 @@
 """From photos to poses: features, matches, mapping, and second looks where a first one cannot be trusted.
 
 features ─► matches ─► mapping ─► many left out: learned features too
-                               └► few photos: thorough features ─► silhouettes ─► do the photos agree? no: SIFT alone
+                               └► few photos: thorough features ─► silhouettes ─► the same with SIFT alone ─► do the
+                                  photos agree?
 """
 
 from __future__ import annotations
@@ -12,12 +13,17 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from gsopt.config.bounds import Features
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.sfm import diagnosis, features, few_photos, known_poses, mapping
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.held_by_silhouettes import held_by_silhouettes, outline_misses
+from gsopt.data.sfm.held_lens import support
 from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, match_joined
 from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
@@ -27,11 +33,14 @@ from gsopt.data.sfm.photos import Photo
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.silhouettes import CONTRADICTED
 from gsopt.data.sfm.stage_times import StageTimes
+from gsopt.data.sfm.trajectory import turns_apart
 from gsopt.errors import UsageError
 from gsopt.events import Report
 
 LEARNED_UP_TO = 60
 """Photos up to which learned features are looked for where SIFT fails: 10 CPU seconds a photo."""
+MOST_APART = 5.0
+"""Degrees by which the turns between photos differ, in the median pair, where two searches found the same poses."""
 DISAGREEMENT = (
     "The photos contradict the poses that their features give: {} of {} times what one photo shows looks otherwise in "
     "another one that would have been taken from nearly the same side. Where a thing looks alike from several sides, "
@@ -89,16 +98,18 @@ class PoseSearch:
         return self._of_few(project, found) if self._is_few() else found
 
     def _of_few(self, project: ColmapProject, found: FoundPoses) -> FoundPoses:
-        """Poses that the photos themselves agree with: SIFT alone takes fewer sides of a thing for each other."""
+        """Poses that the photos agree with. SIFT alone takes fewer sides of a thing for each other: its poses are kept
+        where the photos contradict the first ones, or where they are other ones and more points hold them."""
         found = self._looked_thoroughly(project, found)
         seen = self._agreement(found)
-        if not seen.contradicts:
-            return found
         if self.config.features == "auto" and found.features != "sift":
-            self.report("the photos contradict these poses: looking with SIFT alone")
             again = self._with_sift()
             if again.mapped is not None and not self._agreement(again).contradicts:
-                return again
+                first = None if seen.contradicts else found.mapped
+                if first is None or _holds_others(again.mapped, first):
+                    return again
+        if not seen.contradicts:
+            return found
         return replace(found, mapped=None, notes=[*found.notes, DISAGREEMENT.format(seen.contradicted, seen.compared)])
 
     def _agreement(self, found: FoundPoses) -> Agreement:
@@ -148,6 +159,7 @@ class PoseSearch:
 
     def _with_sift(self) -> FoundPoses:
         """Look at few photos a second time, with SIFT alone."""
+        self.report("looking with SIFT alone too, which takes fewer sides of a thing for each other")
         self.learned = None
         return self._looked_thoroughly(*self._again("sift"))
 
@@ -222,6 +234,19 @@ class PoseSearch:
             return mapping.find_poses(project, graph, self.report)
         found = known_poses.triangulate(project, frames)
         return MappingResult(found, "poses as given", [])
+
+
+def _holds_others(one: MappingResult, other: MappingResult) -> bool:
+    """True where one places as many photos as the other, with other poses, and more holds them."""
+    common = sorted(one.names & other.names)
+    apart = turns_apart(*(_viewmats(mapped.reconstruction, common) for mapped in (one, other)))
+    firmer = support(one.reconstruction) > support(other.reconstruction)
+    return len(one.names) >= len(other.names) and apart > MOST_APART and firmer
+
+
+def _viewmats(reconstruction: Any, names: list[str]) -> Float[np.ndarray, "C 4 4"]:
+    images = {image.name: image for image in map(reconstruction.image, reconstruction.reg_image_ids())}
+    return np.stack([np.vstack([images[name].cam_from_world().matrix(), [0, 0, 0, 1]]) for name in names])
 
 
 def _learned_installed() -> bool:

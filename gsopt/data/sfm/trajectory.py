@@ -41,6 +41,14 @@ def compare(found: Float[np.ndarray, "C 4 4"], truth: Float[np.ndarray, "C 4 4"]
     )
 
 
+def turns_apart(found: Float[np.ndarray, "C 4 4"], truth: Float[np.ndarray, "C 4 4"]) -> float:
+    """Degrees between the turns from one camera to another in both, in the median pair; 0 for a single camera. No
+    similarity between the two is needed."""
+    turns = [np.einsum("bij,akj->abik", poses[:, :3, :3], poses[:, :3, :3]) for poses in (found, truth)]
+    cosine = (np.einsum("abij,abij->ab", *turns)[np.triu_indices(len(found), 1)] - 1) / 2
+    return float(np.degrees(np.arccos(np.median(np.clip(cosine, -1, 1))))) if len(found) > 1 else 0.0
+
+
 def align(source: Float[np.ndarray, "C 3"], target: Float[np.ndarray, "C 3"]) -> Similarity:
     """The similarity that takes `source` closest to `target` in the least squares sense (Umeyama 1991, eq. 34-43)."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)

@@ -11,6 +11,7 @@ import pytest
 from test_answers import CHAIN, graph
 
 from gsopt.data.sfm import few_photos, known_poses, mapping, pose_search
+from gsopt.data.sfm.features import ColmapProject
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.photo_agreement import Agreement
 from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
@@ -178,31 +179,79 @@ def test_the_largest_of_global_reconstructions_is_repaired_where_photos_are_miss
 
 
 @pytest.mark.parametrize(
-    ("features", "contradicted", "kept"),
+    ("features", "nothing", "contradicted", "others_hold", "kept"),
     [
-        ("auto", {}, "both"),
-        ("auto", {"both"}, "sift"),
-        ("auto", {"both", "sift"}, None),
-        ("both", {"both"}, None),
-        ("sift", {"sift"}, None),
-        ("sift", {}, "sift"),
+        ("auto", (), (), False, "both"),
+        ("auto", (), (), True, "sift"),
+        ("auto", (), ("both",), False, "sift"),
+        ("auto", (), ("both", "sift"), True, None),
+        ("auto", (), ("sift",), True, "both"),
+        ("auto", ("sift",), ("both",), True, None),
+        ("auto", ("both",), (), False, "sift"),
+        ("auto", ("both",), ("sift",), False, None),
+        ("both", (), ("both",), True, None),
+        ("both", (), (), True, "both"),
+        ("sift", (), ("sift",), True, None),
+        ("sift", (), (), True, "sift"),
     ],
 )
-def test_poses_of_few_photos_that_contradict_them_are_sought_with_sift_alone_or_refused(
-    features: str, contradicted: set[str], kept: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_sift_alone_replaces_poses_of_few_photos_that_the_photos_or_more_points_contradict(
+    features: str,
+    nothing: tuple[str, ...],
+    contradicted: tuple[str, ...],
+    others_hold: bool,
+    kept: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    """What the user has asked for is not replaced."""
+    """What the user has asked for is not replaced; what the photos contradict is refused."""
     run = search(tmp_path, 6, features=features)
     monkeypatch.setattr(pose_search, "_learned_installed", lambda: True)
     monkeypatch.setattr(run, "_graph", lambda project, frames=None: f"graph of {project.config.features}")
-    monkeypatch.setattr(
-        run, "_mapped", lambda project, *_: SimpleNamespace(reconstruction=project.config.features, names=["a"] * 6)
-    )
+
+    def mapped(project: ColmapProject, *_: object) -> Any:
+        kind = project.config.features
+        return None if kind in nothing else SimpleNamespace(reconstruction=kind, names=["a"] * 6)
+
+    monkeypatch.setattr(run, "_mapped", mapped)
     monkeypatch.setattr(run, "_looked_thoroughly", lambda project, found: found)
+    monkeypatch.setattr(pose_search, "_holds_others", lambda one, other: others_hold)
     monkeypatch.setattr(
         pose_search, "agreement", lambda reconstruction, photos: Agreement(9, 2 * (reconstruction in contradicted))
     )
     found = run.found(None)
     assert (found.mapped and found.mapped.reconstruction) == kept
     assert found.graph == f"graph of {kept or ('sift' if features == 'sift' else 'both')}"
-    assert ["2 of 9 times" in note for note in found.notes] == ([] if kept else [True])
+    refuted = kept is None and "both" not in nothing
+    assert ["2 of 9 times" in note for note in found.notes] == ([True] if refuted else [])
+
+
+@pytest.mark.parametrize(
+    ("turned", "more", "fewer", "holds"),
+    [(0.0, True, False, False), (2.0, True, False, False), (6.0, True, False, True), (60.0, False, False, False),
+     (60.0, True, True, False)],
+)  # fmt: skip
+def test_other_poses_of_as_many_photos_with_more_support_replace_the_first(
+    turned: float, more: bool, fewer: bool, holds: bool
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+
+    def result(step: float, points: int, photos: int) -> MappingResult:
+        """Cameras that each turn by so many degrees from the one before."""
+        found = pycolmap.Reconstruction()
+        camera = pycolmap.Camera(model="PINHOLE", width=9, height=9, params=[9.0, 9.0, 4.5, 4.5], camera_id=1)
+        found.add_camera_with_trivial_rig(camera)
+        keypoints = np.full((points, 2), 4.5)
+        for number in range(photos):
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, np.radians(step * number), 0.0])), np.zeros(3))
+            image = pycolmap.Image(name=f"{number}.png", keypoints=keypoints, camera_id=1, image_id=number + 1)
+            found.add_image_with_trivial_frame(image, pose)
+        for row in range(points):
+            track = pycolmap.Track()
+            for number in (1, 2):
+                track.add_element(number, row)
+            found.points3D[found.add_point3D(np.array([0.0, 0.0, 5.0]), track)].error = 0.1
+        return MappingResult(found, "found", [])
+
+    first, second = result(20, 10, 4), result(20 + turned, 20 if more else 5, 3 if fewer else 4)
+    assert pose_search._holds_others(second, first) == holds
