@@ -165,3 +165,35 @@ def test_the_largest_of_global_reconstructions_is_repaired_where_photos_are_miss
     placed = mapping.run_mapper(project, "hybrid", SimpleNamespace(features=dict.fromkeys(range(5), 9)))  # type: ignore[arg-type]
     assert bool(calls) == repaired
     assert [model.count for model in placed] == [count for count in found if count >= 3]
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_poses_that_are_given_are_not_looked_for(posed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither with learned features nor thoroughly, nor are they moved by silhouettes."""
+    looked: list[str] = []
+
+    def look(name: str) -> Any:
+        return lambda *args: looked.append(name) or args[-2:]
+
+    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
+    found = MappingResult(SimpleNamespace(), "found", [])
+    stages: dict[str, Any] = {
+        "_photos": lambda: ([1, 2, 3], []),
+        "_prior_frames": lambda photos: [] if posed else None,
+        "_chosen_features": lambda photos: "sift",
+        "_graph": lambda *_: (graph(CHAIN), "exhaustive"),
+        "_mapped": lambda *_: found,
+        "_wants_learned": lambda *_: True,
+        "_learned": look("learned"),
+        "_is_few": lambda *_: True,
+        "_few": look("few"),
+        "_held": lambda project, mapped, inputs: looked.append("held") or mapped,
+        "_diagnose": lambda *_: "diagnosis",
+        "_placed": lambda *_: None,
+        "_write": lambda *_, **__: tmp_path / "scene",
+    }
+    for name, stage in stages.items():
+        monkeypatch.setattr(run, name, stage)
+    monkeypatch.setattr(pipeline, "prepare_masks", lambda *_: SimpleNamespace(photos=tmp_path))
+    assert run.posed() == (tmp_path / "scene", "diagnosis")
+    assert looked == ([] if posed else ["learned", "few", "held"])
