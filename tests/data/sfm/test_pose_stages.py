@@ -14,6 +14,7 @@ from gsopt.data.sfm import few_photos, known_poses, mapping, pipeline
 from gsopt.data.sfm.features import ColmapProject
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.errors import InputError
 
 
 @pytest.mark.parametrize("posed", [False, True])
@@ -197,3 +198,27 @@ def test_poses_that_are_given_are_not_looked_for(posed: bool, tmp_path: Path, mo
     monkeypatch.setattr(pipeline, "prepare_masks", lambda *_: SimpleNamespace(photos=tmp_path))
     assert run.posed() == (tmp_path / "scene", "diagnosis")
     assert looked == ([] if posed else ["learned", "few", "held"])
+
+
+@pytest.mark.parametrize(("read", "refused", "looked"), [(0, 2, False), (1, 0, False), (2, 0, True), (2, 1, True)])
+def test_features_of_two_photos_are_compared_and_of_one_are_not(
+    read: int, refused: int, looked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The refusal of two names what they lack; one alone, or none that can be read, is refused at once."""
+    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
+    stages: dict[str, Any] = {
+        "_photos": lambda: (["photo"] * read, ["refused"] * refused),
+        "_prior_frames": lambda photos: None,
+        "_chosen_features": lambda photos: "sift",
+        "_graph": lambda *_: (graph(CHAIN), "exhaustive"),
+        "_mapped": lambda *_: None,
+        "_wants_learned": lambda *_: False,
+        "_is_few": lambda *_: False,
+    }
+    for name, stage in stages.items():
+        monkeypatch.setattr(run, name, stage)
+    monkeypatch.setattr(pipeline, "prepare_masks", lambda *_: SimpleNamespace(photos=tmp_path))
+    monkeypatch.setattr(pipeline.diagnosis, "explain", lambda *_: SimpleNamespace(advice=[]))
+    monkeypatch.setattr(pipeline, "too_few", lambda report, graph: InputError("alone" if graph is None else "compared"))
+    with pytest.raises(InputError, match="compared" if looked else "alone"):
+        run.posed()
