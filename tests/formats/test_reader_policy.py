@@ -17,6 +17,7 @@ from splat_samples import make_splats, same_bits
 from gsopt.cli import main
 from gsopt.errors import InputError, InputWarning
 from gsopt.formats import load_splats, save_splats
+from gsopt.formats.validation import BYTE_OPACITY_MARGIN
 from gsopt.gaussians import Gaussians
 from gsopt.raster.backend import ALPHA_MAX, ALPHA_MIN
 
@@ -64,6 +65,7 @@ def test_an_infinite_logit_renders_as_0_or_1_does(tmp_path: Path) -> None:
         low, high = load_splats(tmp_path / "a.ply").opacities.tolist()
     assert low < ALPHA_MIN
     assert high >= ALPHA_MAX
+    assert (low, high) == pytest.approx((BYTE_OPACITY_MARGIN, 1 - BYTE_OPACITY_MARGIN), rel=1e-4)  # as of bytes
 
 
 def test_strict_refuses_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

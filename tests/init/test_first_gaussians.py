@@ -13,11 +13,11 @@ from gsopt.config.train import DataConfig, InitConfig
 from gsopt.data.scene import Points, Scene, load_scene
 from gsopt.errors import UsageError
 from gsopt.geometry.cameras import Cameras, look_at
-from gsopt.geometry.focus import find_focus
-from gsopt.geometry.projection import sees
+from gsopt.geometry.focus import Focus, find_focus
+from gsopt.geometry.projection import project, sees
 from gsopt.geometry.sh import rgb_from_sh0
 from gsopt.init import first_gaussians
-from gsopt.init.frustum import random_points
+from gsopt.init.frustum import BACKGROUND_FAR, random_points
 from gsopt.init.neighbors import mean_neighbor_distance
 
 pytestmark = pytest.mark.usefixtures("coarse_hull")
@@ -143,6 +143,18 @@ def test_no_random_point_is_drawn_where_fewer_than_half_of_the_cameras_look() ->
     assert float((2 * seen(focus.point + ball) < 8).double().mean()) > 0.2
     points = random_points(cameras, focus, 500, False, torch.Generator().manual_seed(0))
     assert 2 * int(seen(points).min()) >= 8
+
+
+def test_points_along_pixels_lie_at_uniform_inverse_depths() -> None:
+    """From a fifth of the distance to the focus on to BACKGROUND_FAR of them, where the axes do not meet."""
+    camera = cameras_at(torch.tensor([[3.0, 0, 0]]), torch.zeros(1, 3))[0]
+    focus = Focus(torch.zeros(3), 3.0, 1.0, converging=False)
+    _, _, depths = project(camera, random_points([camera], focus, 4000, False, torch.Generator().manual_seed(0)))
+    near, far = 1 / (0.2 * 3), 1 / (BACKGROUND_FAR * 3)
+    share = (1 / depths - far) / (near - far)
+    assert -1e-4 < float(share.min()) < 0.01
+    assert 0.99 < float(share.max()) < 1 + 1e-4
+    torch.testing.assert_close(share.sort().values, torch.linspace(0, 1, 4000), rtol=0, atol=0.04)
 
 
 EYES = torch.tensor([[3.0, 0, 0], [0, 3.0, 0.1], [-3.0, 0.1, 0], [0.1, -3.0, 0]])

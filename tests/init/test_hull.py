@@ -49,6 +49,13 @@ def test_points_of_the_shape_are_in_the_hull_and_points_well_outside_are_not(sce
     assert float(in_hull(photos, surface * 1.25 + torch.tensor(CENTER)).double().mean()) < 0.01
 
 
+@pytest.mark.parametrize(("weight", "colored"), [(0.0, False), (0.01, True), (1.0, True)])
+def test_a_view_without_weight_gives_its_silhouette_alone(scene: Scene, weight: float, colored: bool) -> None:
+    (photo,) = small_photos([replace(scene.train[0], color=weight)], 1)
+    assert photo.colored == colored
+    assert torch.equal(photo.planes, small_photos(scene.train[:1], 1)[0].planes)
+
+
 def test_more_views_carve_more(scene: Scene) -> None:
     photos = small_photos(scene.train, 100)
     points = 2 * torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) - 1

@@ -80,6 +80,17 @@ def test_haze_before_one_camera_goes_and_held_out_views_do_not_lose(tmp_path: Pa
     assert clean.input_psnr(run, run.gaussians.select(keep), test) >= clean.input_psnr(run, run.gaussians, test) - 1e-6
 
 
+def test_haze_is_what_at_most_two_views_see_before_half_of_the_depth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = open_run(make_run(tmp_path, train=6))
+    views, nearness = torch.full((GOOD,), 6.0), torch.ones(GOOD)
+    views[:4], nearness[:4] = torch.tensor([1.0, 2, 3, 2]), torch.tensor([0.4, 0.49, 0.4, 0.5])
+    seen = clean.Observation(torch.ones(GOOD), torch.zeros(GOOD), views, nearness)
+    monkeypatch.setattr(clean, "observe", lambda *_: seen)
+    assert named(clean.findings(run, views_of(run)), "haze") == [0, 1]
+
+
 def test_what_the_input_views_need_is_kept_whatever_a_rule_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

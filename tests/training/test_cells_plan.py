@@ -21,7 +21,8 @@ from gsopt.training.cells import divide as divide_module
 from gsopt.training.cells.divide import divide, ground_axes, relevant, split
 from gsopt.training.cells.plan import Cell, CellPlan, read_plan, sha256
 from gsopt.training.cells.size import cell_sizes, sizes_of
-from gsopt.training.estimate import PIXEL_BYTES
+from gsopt.training.cells.stages import coarse_stage, polish_stage
+from gsopt.training.estimate import PIXEL_BYTES, of_sizes
 from gsopt.training.plan import RunPlan
 
 
@@ -202,3 +203,15 @@ def test_memory_is_estimated_for_the_largest_view(data: Path) -> None:
     for part in ("coarse", "cell", "polish", "whole"):
         few, many = (getattr(sizes_of(2, config, plan, one, None, 0), part).memory for one in (smaller, mixed))
         assert many - few == PIXEL_BYTES * (large.camera.width * large.camera.height - 64)
+
+
+def test_time_is_estimated_for_the_steps_that_a_stage_takes(data: Path) -> None:
+    config = big(data, iterations=100)
+    scene = load_scene(str(data))
+    plan = RunPlan.of(config, scene)
+    found, budget = sizes_of(2, config, plan, scene, None, 0), plan.density.max_gaussians
+    degree, pixels = plan.schedule.max_sh_degree, max(view.camera.width * view.camera.height for view in scene.train)
+    coarse, polish = coarse_stage(config, 2, budget).config, polish_stage(config, budget, data).config
+    assert (coarse.iterations, polish.iterations) == (30, 30)
+    assert found.coarse.seconds == of_sizes(math.ceil(budget / 2), degree, pixels, 0, coarse.iterations).seconds
+    assert found.polish.seconds == of_sizes(budget, degree, pixels, 0, polish.iterations).seconds

@@ -47,6 +47,17 @@ def test_bands_come_one_by_one_and_never_pass_the_highest(step: int, every: int,
     assert later == min(now + 1, highest)
 
 
+@pytest.mark.parametrize("every", [90, 100, 300])
+def test_a_run_is_complete_from_the_first_settled_step_that_draws_all_bands(every: int) -> None:
+    config = TrainConfig(optimizer=OptimizerConfig(sh_degree_every=every), density=DensityConfig(refine_stop=300))
+    run = made(replace(config, iterations=1000))
+    steps = range(1, 1001)
+    assert [run.is_complete(step) for step in steps] == [
+        run.is_settled(step) and run.sh_degree(step) == run.max_sh_degree for step in steps
+    ]
+    assert sum(not run.is_complete(step) for step in steps) == max(run.refine_stop, *run.coarse_until, 3 * every)
+
+
 def test_few_views_are_learned_more_slowly_and_what_is_given_stays() -> None:
     few, many = made(TrainConfig(), views=4), made(TrainConfig())
     assert few.lr_means(0) < many.lr_means(0)

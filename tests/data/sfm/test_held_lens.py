@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gsopt.data.sfm import mapping
-from gsopt.data.sfm.features import ColmapProject
+from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.settings import SfmConfig
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -76,3 +76,51 @@ def test_focal_lengths_are_held_until_one_places_enough_photos(
     models, asked = held_models(tmp_path, placed, monkeypatch)
     assert asked == tried
     assert [(model.name, model.num_reg_images()) for model in models] == best
+
+
+def test_one_small_reconstruction_of_the_best_connected_photos_calibrates_a_lens_without_exif(tmp_path: Path) -> None:
+    """The largest one that is found; a lens from EXIF stays, and where all are known nothing is reconstructed."""
+    asked: list[Any] = []
+
+    def incremental(database: Path, photos: Path, target: Path, *, options: Any) -> dict[int, Any]:
+        asked.append(options)
+        found = {}
+        for number, focal in enumerate((90.0, 77.0)):
+            model = pycolmap.Reconstruction()
+            for camera_id, length in ((1, 200.0), (2, focal)):
+                lens = pycolmap.Camera(
+                    model="SIMPLE_RADIAL", width=100, height=80, params=[length, 50, 40, 0], camera_id=camera_id
+                )
+                model.add_camera_with_trivial_rig(lens)
+            for image_id in range(1, 3 + 2 * number):
+                image = pycolmap.Image(name=f"{image_id}.png", camera_id=1 + image_id % 2, image_id=image_id)
+                model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+            found[number] = model
+        return found
+
+    database = tmp_path / "photos.db"
+    with pycolmap.Database.open(database) as db:
+        for focal, known in ((123.0, True), (50.0, False)):
+            camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", focal, 100, 80)
+            camera.has_prior_focal_length = known
+            db.write_camera(camera)
+    colmap: Any = SimpleNamespace(
+        Database=pycolmap.Database,
+        IncrementalPipelineOptions=pycolmap.IncrementalPipelineOptions,
+        incremental_mapping=incremental,
+    )
+    project = ColmapProject(colmap, database, tmp_path, SfmConfig())
+    graph = ViewGraph(
+        {"a.png": 900, "b.png": 900, "c.png": 900}, {("a.png", "b.png"): 80, ("b.png", "c.png"): 90}, frozenset()
+    )
+    for folder in ("first", "second"):
+        (tmp_path / folder).mkdir()
+        mapping._calibrate_by_seed(project, tmp_path / folder, graph)
+    (options,) = asked
+    assert not options.multiple_models
+    assert options.image_names == mapping.seed_photos(graph, mapping.SEED_PHOTOS)
+    with pycolmap.Database.open(database) as db:
+        assert [(camera.params[0], camera.has_prior_focal_length) for camera in db.read_all_cameras()] == [
+            (123.0, True),
+            (77.0, True),
+        ]

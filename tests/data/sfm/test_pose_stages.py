@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from test_answers import CHAIN, graph
 
-from gsopt.data.sfm import few_photos, known_poses, mapping, pose_search
+from gsopt.data.sfm import few_photos, known_poses, mapping, pipeline, pose_search
 from gsopt.data.sfm.features import ColmapProject
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.photo_agreement import Agreement
 from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.stage_times import StageTimes
+from gsopt.errors import InputError
 
 
 def search(work: Path, count: int, **settings: Any) -> PoseSearch:
@@ -255,3 +256,44 @@ def test_other_poses_of_as_many_photos_with_more_support_replace_the_first(
 
     first, second = result(20, 10, 4), result(20 + turned, 20 if more else 5, 3 if fewer else 4)
     assert pose_search._holds_others(second, first) == holds
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_poses_that_are_given_are_not_looked_for(posed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither with learned features nor thoroughly, nor are they moved by silhouettes."""
+    looked: list[str] = []
+    run = search(tmp_path, 3)
+    first = MappingResult(SimpleNamespace(), "found", [])
+    stages: dict[str, Any] = {
+        "_chosen_features": lambda: "sift",
+        "_graph": lambda *_: graph(CHAIN),
+        "_mapped": lambda *_: first,
+        "_wants_learned": lambda mapped: True,
+        "_with_learned": lambda found: looked.append("learned") or found,
+        "_few": lambda project, found: looked.append("few") or found,
+        "_held": lambda project, found, mapped: looked.append("held") or found,
+        "_agreement": lambda found: looked.append("agreement") or Agreement(0, 0),
+    }
+    for name, stage in stages.items():
+        monkeypatch.setattr(run, name, stage)
+    found = run.found([] if posed else None)
+    assert (found.mapped, found.features, found.notes) == (first, "sift", [])
+    assert looked == ([] if posed else ["learned", "few", "held", "agreement"])
+
+
+@pytest.mark.parametrize(("read", "refused", "looked"), [(0, 2, False), (1, 0, False), (2, 0, True), (2, 1, True)])
+def test_features_of_two_photos_are_compared_and_of_one_are_not(
+    read: int, refused: int, looked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The refusal of two names what they lack; one alone, or none that can be read, is refused at once."""
+    run = pipeline._Run(SimpleNamespace(), Path(), tmp_path, SfmConfig(), lambda line: None)  # type: ignore[arg-type]
+    monkeypatch.setattr(run, "_photos", lambda: (["photo"] * read, ["refused"] * refused))
+    monkeypatch.setattr(run, "_prior_frames", lambda photos: None)
+    monkeypatch.setattr(PoseSearch, "found", lambda self, frames: FoundPoses(graph(CHAIN), None, "sift", ["note"]))
+    monkeypatch.setattr(pipeline, "prepare_masks", lambda *_: SimpleNamespace(photos=tmp_path))
+    report = SimpleNamespace(advice=[])
+    monkeypatch.setattr(pipeline.diagnosis, "explain", lambda *_: report)
+    monkeypatch.setattr(pipeline, "too_few", lambda report, graph: InputError("alone" if graph is None else "compared"))
+    with pytest.raises(InputError, match="compared" if looked else "alone"):
+        run.posed()
+    assert report.advice == (["note"] if looked else [])

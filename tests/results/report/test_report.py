@@ -113,6 +113,16 @@ def test_nobody_who_did_not_ask_for_vgg_reads_of_it(run: Path, page: Page) -> No
     assert "0.1234" in asked.text
 
 
+def test_the_time_is_that_of_the_metrics_or_else_of_the_last_progress(run: Path, page: Page) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert "train_seconds" not in metrics
+    assert re.search(r"Training\s*50 s", page.text)
+    (run / "metrics.json").write_text(json.dumps({**metrics, "train_seconds": 12.0}))
+    timed = Page(write_report(run).read_text(encoding="utf-8"))
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert re.search(r"Training\s*12 s", timed.text)
+
+
 def test_strings_from_files_stay_text(run: Path, page: Page) -> None:
     assert EVIL in page.text
     assert EVIL not in (run / "report.html").read_text(encoding="utf-8")
