@@ -21,6 +21,7 @@ from PIL import Image
 
 from gsopt.data.image_files import IMAGE_FORMATS
 from gsopt.data.resample import sample
+from gsopt.raster.threads import one_torch_thread
 
 MAX_SIDE = 800
 """Longer side of the photos that are compared, px."""
@@ -93,7 +94,8 @@ class _Photo:
 
 def agreement(reconstruction: Any, photos: Path) -> Agreement:
     """Compares all pairs of placed photos that see enough points from the same side."""
-    medians = [median for _, _, median in correlations(reconstruction, photos)]
+    with one_torch_thread():
+        medians = [median for _, _, median in correlations(reconstruction, photos)]
     return Agreement(len(medians), sum(median < ALIKE for median in medians))
 
 
