@@ -17,7 +17,7 @@ from gsopt.data.sfm.photo_agreement import Agreement
 from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.stage_times import StageTimes
-from gsopt.errors import InputError
+from gsopt.errors import InputError, UsageError
 
 
 def search(work: Path, count: int, **settings: Any) -> PoseSearch:
@@ -297,3 +297,39 @@ def test_features_of_two_photos_are_compared_and_of_one_are_not(
     with pytest.raises(InputError, match="compared" if looked else "alone"):
         run.posed()
     assert report.advice == (["note"] if looked else [])
+
+
+def test_an_empty_folder_is_filled_and_another_one_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def child(source: Path, work: Path, *_: Any) -> tuple[None, dict[str, float]]:
+        (work / pipeline.SCENE).mkdir()
+        (work / pipeline.SCENE / "images.bin").touch()
+        return None, {}
+
+    monkeypatch.setattr(pipeline, "run_in_child", child)
+    out = tmp_path / "out"
+    out.mkdir()
+    assert pipeline.pose_photos(tmp_path, out, SfmConfig()).path == out
+    assert [path.name for path in out.iterdir()] == ["images.bin"]
+    with pytest.raises(UsageError, match="must not exist yet"):
+        pipeline.pose_photos(tmp_path, out, SfmConfig())
+
+
+@pytest.mark.parametrize("grows", [True, False])
+def test_a_repair_grows_the_largest_global_model_or_leaves_all(
+    grows: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def model(count: int) -> Any:
+        return SimpleNamespace(
+            num_reg_images=lambda: count, write=lambda folder: (folder / "images.bin").write_text(str(count))
+        )
+
+    def incremental(project: Any, target: Path, start: Path) -> list[str]:
+        assert target.is_dir()
+        assert (start / "images.bin").read_text() == "5"
+        return ["grown"] if grows else []
+
+    monkeypatch.setattr(mapping, "_incremental", incremental)
+    models = [model(3), model(5), model(4)]
+    assert mapping._repaired(SimpleNamespace(), models, tmp_path) == (["grown"] if grows else models)  # type: ignore[arg-type]
