@@ -16,7 +16,7 @@ from balls import Ball, ring, write_balls
 from PIL import Image
 
 from gsopt.data.scene import View, load_scene
-from gsopt.data.sfm import pipeline, silhouettes
+from gsopt.data.sfm import pipeline, pose_search, silhouettes
 from gsopt.data.sfm.held_by_silhouettes import REFUTED, held_by_silhouettes, loosely_held, outline_misses
 from gsopt.data.sfm.mapping import registered
 from gsopt.data.sfm.masks import FeatureInput
@@ -349,7 +349,7 @@ def test_few_photos_are_held_by_their_masks(
         seen.append(inputs)
         return made if believed else None, ["They do not fit."]
 
-    monkeypatch.setattr(pipeline, "held_by_silhouettes", contradicted)
+    monkeypatch.setattr(pose_search, "held_by_silhouettes", contradicted)
     masks = tmp_path / "masks"
     masks.mkdir()
     for photo in find_photos(room_photos):
