@@ -150,7 +150,7 @@ def find_poses(pycolmap: Any, options: argparse.Namespace, mapper: str) -> dict[
     if mapped is None:
         return {"registered": 0}
     found = mapped.reconstruction
-    similarity = placement.place(pipeline.poses(found)[1], pipeline.points(found)[0])
+    similarity = placement.place(mapping.poses(found)[1], pipeline.points(found)[0])
     figures = {
         "registered": len(mapped.names),
         "reprojection_error_px": round(found.compute_mean_reprojection_error(), 4),

@@ -42,7 +42,7 @@ ONCE = (*TWICE, *REST)
 
 @dataclass(frozen=True)
 class TableScene:
-    """What stands on the table, the table's picture (None: it is plain), and the degrees that the camera goes round."""
+    """Things on a table, its picture (None: it is plain), and the degrees that the camera goes round."""
 
     things: tuple[str, ...]
     table: str | None

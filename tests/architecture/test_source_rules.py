@@ -100,7 +100,7 @@ def names_of(*nodes: ast.AST) -> set[str]:
 
 
 def bindings_in(node: ast.AST) -> Iterator[ast.expr]:
-    """What the comprehensions of an expression bind."""
+    """Targets of the comprehensions in an expression."""
     return (inner.target for inner in ast.walk(node) if isinstance(inner, ast.comprehension))
 
 

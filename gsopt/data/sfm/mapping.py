@@ -13,8 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from gsopt.data.sfm.features import ColmapProject, ViewGraph
 from gsopt.data.sfm.held_lens import focals_to_try, guessed_lens, hold_lens, support
+from gsopt.data.sfm.photos import natural
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.events import Report
 
@@ -70,6 +74,15 @@ class MappingResult:
 def registered(reconstruction: Any) -> set[str]:
     """Names of the photos that have a pose."""
     return {reconstruction.image(i).name for i in reconstruction.reg_image_ids()}
+
+
+def poses(reconstruction: Any) -> tuple[list[str], Float[np.ndarray, "C 4 4"]]:
+    """Names in order and cam_from_world of the registered photos."""
+    images = sorted(
+        (reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: natural(image.name)
+    )
+    viewmats = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
+    return [image.name for image in images], viewmats
 
 
 def find_poses(project: ColmapProject, graph: ViewGraph, report: Report) -> MappingResult | None:

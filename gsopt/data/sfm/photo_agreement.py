@@ -45,7 +45,7 @@ ALIKE = 0.25
 """Median correlation of the patches below which a photo contradicts another one."""
 LEAST_CONTRADICTED, MOST_CONTRADICTED = 2, 1 / 6
 """Contradictions from which on poses are wrong, and their share. Right poses: 6 of 52 (a ball that hides much), 1 of 16
-and less (a shiny head, a fox, rendered tables); wrong ones: 2 of 8, 8 of 24, 18 of 29 (docs/decisions/0025)."""
+and less (a shiny head, a fox, rendered tables); wrong ones: 2 of 8, 8 of 24, 18 of 29 (decision 0025)."""
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ from gsopt.data.scene import read_dataset
 from gsopt.data.sfm import diagnosis, known_poses
 from gsopt.data.sfm.child_process import run_in_child
 from gsopt.data.sfm.diagnosis import Diagnosis
-from gsopt.data.sfm.mapping import MappingResult
+from gsopt.data.sfm.mapping import MappingResult, poses
 from gsopt.data.sfm.masks import FeatureInput, mask_folder, prepare_masks
 from gsopt.data.sfm.overview_image import draw_scene
-from gsopt.data.sfm.photos import Photo, RejectedFile, find_photos, natural, read_photos
+from gsopt.data.sfm.photos import Photo, RejectedFile, find_photos, read_photos
 from gsopt.data.sfm.placement import Similarity, place
 from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
 from gsopt.data.sfm.refusal import too_few
@@ -190,15 +190,6 @@ class _Run:
             "seconds": {stage: round(seconds, 2) for stage, seconds in self.times.seconds.items()},
         }
         write_atomic(scene / RECORD, to_json(record))
-
-
-def poses(reconstruction: Any) -> tuple[list[str], Float[np.ndarray, "C 4 4"]]:
-    """Names in order and cam_from_world of the registered photos."""
-    images = sorted(
-        (reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: natural(image.name)
-    )
-    viewmats = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
-    return [image.name for image in images], viewmats
 
 
 def points(reconstruction: Any) -> tuple[Float[np.ndarray, "P 3"], Any]:

