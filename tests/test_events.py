@@ -22,6 +22,7 @@ from gsopt.events import (
     EventWriter,
     read_events,
     refuse_links,
+    sweep,
     sync_folder,
     to_json,
     write_atomic,
@@ -271,3 +272,45 @@ def test_a_log_of_exactly_the_largest_size_is_read(tmp_path: Path, monkeypatch: 
     with pytest.raises(InputError, match="MB of events"):
         read_events(path)
     assert len(read_events(path, len(line))[0]) == 2
+
+
+def test_a_sweep_takes_temporary_files_of_every_folder_and_nothing_else(tmp_path: Path) -> None:
+    half = [".metrics.json.12.tmp", ".a.b.ply.7.tmp", ".tmpab12_Z"]
+    kept = ["a.12.tmp", ".a.12.tmp~", ".a.x.tmp", ".tmpab12", ".tmpab12_Zy", "metrics.json", "..12.tmp"]
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        for name in (*half, *kept):
+            (tmp_path / folder / name).write_bytes(b"")
+    sweep(tmp_path / "one", tmp_path / "two")
+    for folder in ("one", "two"):
+        assert sorted(os.listdir(tmp_path / folder)) == sorted(kept)
+
+
+def test_an_event_names_its_time_in_milliseconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events_module.time, "time", lambda: 1234.56789)
+    writer = EventWriter(tmp_path)
+    event = writer.emit("started")
+    writer.close()
+    assert event == {"v": 1, "seq": 0, "kind": "started", "time": 1234.568}
+    assert read_events(tmp_path / "events.jsonl")[0] == [event]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
+def test_the_owner_alone_may_write_a_log_and_all_may_read_it(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        EventWriter(tmp_path).close()
+    finally:
+        os.umask(before)
+    assert (tmp_path / "events.jsonl").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not list open files")
+def test_a_writer_that_is_refused_keeps_no_file_open(tmp_path: Path) -> None:
+    writer = EventWriter(tmp_path)
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(UsageError):
+        EventWriter(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == before
+    writer.close()
+    assert len(os.listdir("/proc/self/fd")) == before - 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -238,3 +239,70 @@ def test_color_correction_is_fitted_inside_the_mask() -> None:
     corrected = color_corrected(changed, truth, alphas)
     torch.testing.assert_close(corrected[:, :8], truth[:, :8], atol=1e-3, rtol=0)
     assert torch.equal(corrected[:, 8:], changed[:, 8:]), "a background has no exposure"
+
+
+def test_two_equal_images_count_as_a_hundred_decibels() -> None:
+    image, alphas = noise(1, 4, 4, 3), torch.full((1, 4, 4), 0.5)
+    assert capped_psnr(image, image).tolist() == [100]
+    assert object_psnr(image, image, alphas).tolist() == [100]
+    assert bool(object_psnr(image, 1 - image, 0 * alphas).isnan().all())
+
+
+def test_a_pixel_is_clipped_where_any_channel_is_black_or_white() -> None:
+    levels = torch.tensor([[0.0, 9, 9], [1, 9, 9], [9, 0, 9], [9, 9, 254], [9, 9, 255], [255, 255, 255]]) / 255
+    assert metrics._unclipped(levels.T.double()).tolist() == [False, True, False, True, False, False]
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_the_smallest_image_leaves_one_pixel_at_the_last_layer(net: str) -> None:
+    """A window of k px at steps of s px fits (n - k) // s + 1 times into n px."""
+
+    def left(side: int) -> int:
+        for layer in metrics._LAYERS[net]:
+            if layer.pool is not None:
+                side = (side - layer.pool[0]) // layer.pool[1] + 1
+            side = (side + 2 * layer.padding - layer.kernel) // layer.stride + 1
+        return side
+
+    assert left(metrics._SMALLEST[net]) == 1
+    assert left(metrics._SMALLEST[net] - 1) == 0
+
+
+def test_vgg_is_configuration_d_compared_after_each_block() -> None:
+    """Table 1 of Simonyan & Zisserman 2015: thirteen convolutions of 3 x 3, a pooling between the blocks."""
+    layers = metrics._LAYERS["vgg"]
+    assert [layer.out_channels for layer in layers] == [64] * 2 + [128] * 2 + [256] * 3 + [512] * 6
+    assert [layer.in_channels for layer in layers] == [3, *(layer.out_channels for layer in layers[:-1])]
+    assert {(layer.kernel, layer.stride, layer.padding) for layer in layers} == {(3, 1, 1)}
+    assert [row for row, layer in enumerate(layers) if layer.pool == (2, 2)] == [2, 4, 7, 10]
+    assert sum(layer.pool is not None for layer in layers) == 4
+    assert [row for row, layer in enumerate(layers) if layer.tap] == [1, 3, 6, 9, 12]
+    heads = {name: shape for name, shape in metrics._expected_shapes(layers).items() if name.startswith("lin")}
+    assert heads == {f"lin{row}.weight": (width,) for row, width in enumerate((64, 128, 256, 512, 512))}
+
+
+def test_weights_of_just_the_largest_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "w.npz"
+    np.savez(path, **_alex_arrays())
+    with zipfile.ZipFile(path) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+    monkeypatch.setattr(metrics, "MAX_WEIGHT_BYTES", size)
+    Lpips("alex", path)
+    monkeypatch.setattr(metrics, "MAX_WEIGHT_BYTES", size - 1)
+    with pytest.raises(InputError, match=f"at most {size - 1} bytes, got {size}"):
+        Lpips("alex", path)
+
+
+def test_weights_of_whole_numbers_are_refused(tmp_path: Path) -> None:
+    path, arrays = tmp_path / "w.npz", _alex_arrays()
+    np.savez(path, **{**arrays, "conv1.bias": np.zeros(arrays["conv1.bias"].shape, np.int32)})
+    with pytest.raises(InputError, match=r"conv1\.bias.*floats"):
+        Lpips("alex", path)
+
+
+def test_vgg_is_also_looked_for_in_the_cache_of_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(metrics.VGG_VARIABLE, raising=False)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "lpips_vgg16.npz").write_bytes(b"")
+    assert metrics.find_vgg_weights() == tmp_path / "checkpoints" / "lpips_vgg16.npz"

@@ -90,3 +90,11 @@ def test_leaves_that_hold_nothing_but_padding(monkeypatch: pytest.MonkeyPatch) -
     distances = torch.cdist(points.double(), points.double()).fill_diagonal_(torch.inf)
     expected = distances.topk(3, largest=False).values
     torch.testing.assert_close(neighbors.nearest_distances(points, 3).double(), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_mean_is_taken_over_three_neighbors() -> None:
+    places = torch.tensor([0.0, 1, 3, 7, 15])
+    points = torch.stack([places, torch.zeros(5), torch.zeros(5)], dim=1)
+    expected = torch.tensor([1 + 3 + 7, 1 + 2 + 6, 2 + 3 + 4, 4 + 6 + 7, 8 + 12 + 14]) / 3
+    torch.testing.assert_close(mean_neighbor_distance(points), expected)
+    torch.testing.assert_close(mean_neighbor_distance(points, 1), torch.tensor([1.0, 1, 2, 4, 8]))
