@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.geometry.quats import normalize, rotation_matrices
 from gsopt.raster.backend import RasterSettings
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.results.decimate import decimated, masses, merged
+from gsopt.results.decimate import _costs, decimated, masses, merged
 
 
 def many(count: int = 200) -> Gaussians:
@@ -107,3 +108,52 @@ def test_a_share_that_is_none_is_refused_in_one_line(tmp_path: Path, capsys, tex
     assert main(["export", str(make_run(tmp_path)), "-o", str(tmp_path / "a.ply"), f"--decimate={text}"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_a_mass_is_opacity_times_the_area_of_the_two_longest_axes() -> None:
+    cloud = splats(1)
+    cloud = replace(cloud, log_scales=torch.tensor([[0.5, 2.0, 3.0]]).log(), logit_opacities=torch.zeros(1))
+    assert float(masses(cloud)[0]) == pytest.approx(0.5 * 2 * 3)
+    for order in ([2, 0, 1], [1, 2, 0]):
+        assert float(masses(replace(cloud, log_scales=cloud.log_scales[:, order]))[0]) == pytest.approx(3)
+
+
+def test_a_pair_costs_the_weight_that_moves_times_its_distance_and_color() -> None:
+    """Weights 2 and 6 reduce to 12 / 8; variances of 0.04 and 0.09; colors (unit sh0) count one half."""
+    pair = splats(2)
+    means, color = torch.tensor([[0.0, 0, 0], [0.3, 0.4, 0]]), torch.tensor([[[0.0, 0, 0]], [[1.0, 2, 2]]])
+    scales = torch.tensor([[0.2] * 3, [0.3] * 3]).log()
+    pair = replace(pair, means=means, sh0=color, log_scales=scales)
+    found = _costs(pair, torch.tensor([2.0, 6.0]).double(), torch.tensor([[0, 1]]))
+    assert float(found[0]) == pytest.approx(1.5 * (0.25 / 0.13 + 0.5 * 9), rel=1e-5)
+    tiny = replace(pair, log_scales=scales - 20)
+    found = _costs(tiny, torch.tensor([2e-20, 6e-20]).double(), torch.tensor([[0, 1]]))
+    assert float(found[0]) == pytest.approx(1.5e-20 * 0.25 / 0.13 * math.exp(40), rel=1e-4)
+
+
+def test_half_of_what_goes_is_what_contributes_least() -> None:
+    """Of 40 that go from a hundred, the 20 of least contribution leave no trace: the sum of the others' weights does."""
+    cloud = many(100)
+    far = replace(cloud, means=cloud.means + torch.arange(100)[:, None] * 1000.0)
+    weights = torch.arange(100).float() + 1
+    found = decimated(far, 0.6, weights)
+    assert len(found) == 60
+    rows = (found.means[:, 0] / 1000).round()
+    assert float(rows.min()) >= 19.5
+    assert len(decimated(far, 1.0, weights)) == 100
+
+
+def test_a_merged_splat_has_a_true_rotation_and_keeps_opacity_times_area() -> None:
+    cloud = many(40)
+    one = merged(cloud, torch.arange(40).view(20, 2))
+    assert torch.allclose(one.quats.norm(dim=1), torch.ones(20), atol=1e-5)
+    pairs = masses(cloud).view(20, 2).sum(1)
+    longest = one.scales.double().sort(dim=1).values
+    expected = (pairs / (longest[:, 1] * longest[:, 2])).clamp(max=0.995)
+    torch.testing.assert_close(one.opacities.double(), expected, rtol=1e-4, atol=0)
+    moments = cloud.means.double().view(20, 2, 3)
+    share = (masses(cloud) / pairs.repeat_interleave(2)).view(20, 2, 1)
+    mean = (share * moments).sum(1)
+    second = covariances(cloud).view(20, 2, 3, 3) + moments[..., :, None] * moments[..., None, :]
+    expected = (share[..., None] * second).sum(1) - mean[:, :, None] * mean[:, None, :]
+    torch.testing.assert_close(covariances(one), expected, rtol=1e-3, atol=1e-4)

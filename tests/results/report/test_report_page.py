@@ -144,6 +144,9 @@ def test_charts_leave_out_what_was_not_recorded() -> None:
 def test_settings_that_differ_from_the_default_are_bold() -> None:
     default = settings(report())
     assert "changed" not in default
+    assert ">None<" not in default
+    assert "<td></td>" not in default
+    assert "<td>\N{EN DASH}</td>" in default
     assert default.count('class="group"') > 3
     found = settings(report(config=TrainConfig(iterations=77, seed=5)))
     assert found.count('class="changed"') == 2
