@@ -11,6 +11,8 @@ LEFT, RIGHT, TOP, BOTTOM = 52, 14, 14, 36
 MAX_POINTS = 300
 MIN_LOG_VALUE = 1e-300
 """Least value on a logarithmic axis, so that no tick is 0."""
+MIN_RANGE = 1e-300
+"""Values that differ by less count as one: a fraction of the difference may be 0."""
 
 
 def line_chart(title: str, points: Sequence[tuple[float, float]], *, log: bool = False, unit: str = "") -> str:
@@ -53,7 +55,7 @@ def line_chart(title: str, points: Sequence[tuple[float, float]], *, log: bool =
 
 def ticks(low: float, high: float, count: int) -> list[float]:
     """About `count` + 1 round values whose range covers low..high: multiples of 1, 2 or 5 times a power of ten."""
-    if not high > low:
+    if not high - low > MIN_RANGE:
         low, high = low - max(abs(low), 1) * 0.05, high + max(abs(high), 1) * 0.05
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))

@@ -129,7 +129,7 @@ def progress_of(events: Sequence[dict[str, Any]]) -> list[Progress]:
     progress_charts: list[Progress] = []
     for event in events:
         step = number(event.get("step"))
-        if event.get("kind") != "progress" or step is None:
+        if event.get("kind") != "progress" or step is None or step < 0:
             continue
         while progress_charts and progress_charts[-1].step >= step:
             progress_charts.pop()

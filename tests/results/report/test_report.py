@@ -182,6 +182,17 @@ def test_what_a_resumed_run_took_back_is_not_drawn() -> None:
     assert [(moment.step, moment.loss) for moment in progress_charts] == [(10, 0), (20, 1), (25, 3), (35, 4)]
 
 
+def test_steps_before_the_first_are_not_drawn() -> None:
+    events = [{"kind": "progress", "step": step, "loss": 1.0} for step in (-5, -4, -0.5, 0, 1)]
+    assert [moment.step for moment in progress_of(events)] == [0, 1]
+
+
+def test_the_views_between_the_ends_are_evenly_chosen() -> None:
+    """Of 32 between four at each end, the middles of four runs of eight."""
+    shown = representative_rows([float(value) for value in range(40)])
+    assert shown == [0, 1, 2, 3, 8, 16, 24, 32, 36, 37, 38, 39]
+
+
 @pytest.mark.parametrize("count", [1, 2, 12, 13, 40, 200])
 def test_the_views_shown_include_both_ends_in_order(count: int) -> None:
     psnrs = np.random.default_rng(count).permutation(count).astype(float).tolist()

@@ -107,3 +107,9 @@ def test_many_points_become_means_of_runs_and_the_last_stays() -> None:
 )
 def test_numbers_have_four_digits_and_thousands_a_letter(value: float, text: str) -> None:
     assert charts.short(value) == text
+
+
+@pytest.mark.parametrize("high", [5e-324, 1e-301, 0.0])
+def test_values_that_are_all_but_equal_have_ticks(high: float) -> None:
+    assert charts.ticks(0, high, 4) == [-0.05, 0, 0.05]
+    assert 'points="52.0,' in charts.line_chart("PSNR", [(0.0, 0.0), (high, high)])
