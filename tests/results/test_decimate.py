@@ -132,7 +132,7 @@ def test_a_pair_costs_the_weight_that_moves_times_its_distance_and_color() -> No
 
 
 def test_half_of_what_goes_is_what_contributes_least() -> None:
-    """Of 40 that go from a hundred, the 20 of least contribution leave no trace: the sum of the others' weights does."""
+    """Of 40 that go from a hundred, the 20 of least contribution leave no trace."""
     cloud = many(100)
     far = replace(cloud, means=cloud.means + torch.arange(100)[:, None] * 1000.0)
     weights = torch.arange(100).float() + 1
