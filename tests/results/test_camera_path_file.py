@@ -50,6 +50,20 @@ def test_the_file_says_what_nerfstudio_reads(tmp_path: Path) -> None:
     assert float(camera.Ks[0, 1, 1]) == pytest.approx(3 / 0.4663077, rel=1e-5)
 
 
+def test_a_written_file_has_the_fields_of_nerfstudio(tmp_path: Path) -> None:
+    """Three cameras at two frames per second; 32 rows at 80 px focal length are 2 atan(0.2)."""
+    K = torch.tensor([[[80.0, 0, 20], [0, 80, 16], [0, 0, 1]]])
+    camera = Cameras(torch.eye(4)[None], K, 40, 32)
+    write_camera_path(tmp_path / "p.json", [camera] * 3, 2.0, (1.0, 2.0, 3.0))
+    found = json.loads((tmp_path / "p.json").read_text())
+    assert (found["render_width"], found["render_height"], found["fps"], found["seconds"]) == (40, 32, 2, 1.5)
+    assert (found["camera_type"], found["keyframes"], len(found["camera_path"])) == ("perspective", [], 3)
+    entry = found["camera_path"][0]
+    assert entry["aspect"] == 1.25
+    assert entry["fov"] == pytest.approx(math.degrees(2 * math.atan(0.2)))
+    assert entry["camera_to_world"] == [1, 0, 0, 1, 0, -1, 0, 2, 0, 0, -1, 3, 0, 0, 0, 1]
+
+
 def test_a_run_is_rendered_along_a_file_that_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, path = make_run(tmp_path), tmp_path / "path.json"
     assert main(["render", str(run), "--path", "orbit", "--frames", "3", "-o", str(path)]) == 0

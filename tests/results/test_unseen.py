@@ -39,3 +39,8 @@ def test_only_hidden_colors_are_mixed_with_the_mark() -> None:
     mixed = marked(rgb, torch.tensor([False, True]))
     assert torch.equal(mixed[0], rgb[0])
     assert float((mixed[1] - MARK).norm()) < float((rgb[1] - MARK).norm()) / 2
+
+
+def test_seven_tenths_of_a_marked_color_are_the_mark() -> None:
+    mixed = marked(torch.tensor([[0.0, 1.0, 0.5]]), torch.tensor([True]))
+    torch.testing.assert_close(mixed, torch.tensor([[0.7, 0.3 + 0.07, 0.15 + 0.56]]))
