@@ -76,6 +76,7 @@ def test_a_field_is_the_mean_over_the_views_that_see_a_voxel() -> None:
     found = fused([wall(5.0), wall(5.1)], box, solid=True).flatten().tolist()
     assert found == pytest.approx([(0.15 + 0.65) / 2, -1], abs=1e-4)
     assert fused([wall(5.0), wall(5.1)], box, solid=False).flatten().tolist()[1] == 1
+    assert fused([wall(5.0)], box, solid=True).flatten().tolist() == pytest.approx([0.15, -1], abs=1e-4)
 
 
 def test_distances_outside_of_pixels_are_taken_to_their_edge() -> None:
