@@ -73,8 +73,8 @@ def test_room_is_made_three_times_in_the_second_half_of_refinement() -> None:
     config = TrainConfig()
     schedule = plan.make_schedule(config, config.iterations, sparse=False, extent=1.0)
     due = [step for step in range(1, config.iterations + 1) if schedule.turns_over(step)]
-    assert len(due) == 3
-    assert schedule.refine_stop / 2 <= min(due) <= max(due) < schedule.refine_stop
+    assert schedule.refine_stop == 2400
+    assert due == [1200, 1600, 2000]
 
 
 def test_only_adc_makes_room() -> None:
