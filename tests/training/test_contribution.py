@@ -81,3 +81,13 @@ def test_only_adc_makes_room() -> None:
     adc = DensityConfig(turnover=0.2)
     assert plan.density_plan(adc, 100, False, 1.0).turnover == 0.2
     assert plan.density_plan(replace(adc, strategy="mcmc"), 100, False, 1.0).turnover == 0
+
+
+def test_twenty_five_views_are_looked_at_where_there_are_more() -> None:
+    """Of 26 the last is left out; the same 25 alone give the same."""
+    gaussians, cameras = cloud(5, seed=5), ring(26, 1.0)
+    backend = make_backend("cpu")
+    every = [cameras[i] for i in range(26)]
+    found = contributions(gaussians, every, backend, antialiased=False)
+    assert torch.equal(found, contributions(gaussians, every[:25], backend, antialiased=False))
+    assert not torch.equal(found, contributions(gaussians, every[:24], backend, antialiased=False))
