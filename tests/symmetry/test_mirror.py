@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from balls import ring
 from hypothesis import given, settings
@@ -57,3 +59,14 @@ def test_the_camera_behind_the_mirror_is_a_camera() -> None:
     assert torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-6)
     assert float(torch.linalg.det(R)) > 0.999
     assert viewmat[3].tolist() == [0, 0, 0, 1]
+
+
+def test_a_mirror_turns_about_a_center_and_moves_from_it_by_a_share_of_the_radius() -> None:
+    mirror, center = mirror_of(0.3, -0.5, 0.2, 0.4), torch.tensor([1.0, -2.0, 0.5])
+    for change in ([0.0, 0.0, 0.0], [0.01, 0.0, 0.1], [0.0, 0.02, -0.3], [0.03, -0.04, 0.2]):
+        moved = mirror.moved(torch.tensor(change), center, 5.0)
+        away = float(mirror.distance(center)) - 5 * change[2]
+        assert abs(float(moved.distance(center)) - away) < 1e-5
+        turned = torch.linalg.cross(mirror.normal, moved.normal).norm()
+        assert abs(float(turned) - math.sin(math.atan(math.hypot(*change[:2])))) < 1e-5
+    assert mirror.freedom == 3

@@ -325,3 +325,19 @@ def test_a_level_mirror_misses_by_little_and_stands_upright(
     assert len(found) == int(believed)
     assert wanted == [pytest.approx(0.0008 * 50)]
     assert [one.misses for one in found] == [pytest.approx(misses)] * len(found)
+
+
+@pytest.mark.parametrize(("slope", "stays"), [(0.05, True), (0.2, False)])
+def test_a_step_that_leaves_nearly_all_is_not_taken(slope: float, stays: bool) -> None:
+    """Of the misses 1 and slope x at x = 1, a step to 0 leaves 99.9 or 98 percent; 99.5 are too much."""
+    found, _ = sliding(1.0, 1.0, lambda x: torch.tensor([1.0, slope * x], dtype=torch.float64))
+    assert found.at == (1.0 if stays else pytest.approx(0.0, abs=0.02))
+
+
+def test_a_pixel_misses_by_no_more_than_four() -> None:
+    """The images of a mirror far out lie in no silhouette."""
+    outlined = silhouettes.Silhouettes([photo(0), photo(120)], torch.zeros(3), 1.5)
+    far = Mirror(torch.tensor([1.0, 0, 0]), 5.0)
+    misses = outlined.misses(far, outlined.near_optima(far))
+    assert len(misses) > 20
+    assert misses.tolist() == [4.0] * len(misses)

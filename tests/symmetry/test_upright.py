@@ -15,7 +15,7 @@ from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.projection import project
 from gsopt.init.thumbnails import Thumbnail
-from gsopt.symmetry.axis import Axis, _middle_ray
+from gsopt.symmetry.axis import Axis, _middle_ray, middle_axis
 from gsopt.symmetry.find import find_symmetries, with_mirror_images
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.symmetry import Symmetry
@@ -148,3 +148,37 @@ def test_a_record_gives_the_same_axis_and_a_garbled_one_an_error() -> None:
     for change in ({"turns": 1}, {"turns": 10**9}, {"turns": True}, {"point": [0, 0]}, {"direction": [0, 0, 2]}):
         with pytest.raises(InputError, match="the axis"):
             Symmetry.from_dict(record | change)
+
+
+def test_an_axis_moves_sideways_by_shares_of_the_radius() -> None:
+    slanted = Axis(torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.2, 0.1, -0.3]), 6)
+    one, other, both = (
+        slanted.moved(torch.tensor(change), torch.zeros(3), 3.0).point - slanted.point
+        for change in ([0.1, 0.0], [0.0, 0.2], [0.1, 0.2])
+    )
+    assert (float(one.norm()), float(other.norm())) == pytest.approx((0.3, 0.6))
+    assert [float(a @ b) for a, b in ((one, other), (one, slanted.direction), (other, slanted.direction))] == (
+        pytest.approx([0.0] * 3, abs=1e-6)
+    )
+    torch.testing.assert_close(both, one + other)
+    assert slanted.freedom == 2
+
+
+def test_the_distance_from_an_axis_is_that_to_its_nearest_point() -> None:
+    slanted = Axis(torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.2, 0.1, -0.3]), 6)
+    points = torch.rand(7, 3, generator=torch.Generator().manual_seed(2))
+    along = torch.linspace(-3, 3, 60_001)[:, None] * slanted.direction + slanted.point
+    torch.testing.assert_close(slanted.distance(points), torch.cdist(points, along).amin(1), atol=1e-4, rtol=0)
+
+
+def test_the_middle_axis_passes_the_middles_of_silhouettes_at_the_height_of_the_focus() -> None:
+    """One opaque pixel in each of two photos, where they show one point."""
+    around, point, focus = ring(8, size=800), torch.tensor([0.2, -0.1, 0.3]), torch.tensor([-0.3, 0.1, 0.05])
+    photos = []
+    for camera in (around[0].to(torch.float32), around[2].to(torch.float32)):
+        column, row, _ = project(camera, point[None])
+        rgba = torch.zeros(4, camera.height, camera.width, dtype=torch.uint8)
+        rgba[3, int(row), int(column)] = 255
+        photos.append(Thumbnail(camera, rgba))
+    found = middle_axis(photos, UP, focus)
+    assert found.tolist() == pytest.approx([0.2, -0.1, 0.05], abs=0.005)

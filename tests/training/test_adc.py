@@ -64,7 +64,7 @@ SMALL, LARGE = 0.01, 0.04
 def test_statistics_are_the_mean_norm_in_normalized_device_coordinates() -> None:
     model = OptimizedGaussians.start(cloud(3, seed=1))
     density = controlled(model)
-    radii = torch.tensor([[2, 2], [3, 3], [0, 0]], dtype=torch.int32)
+    radii = torch.tensor([[1, 1], [3, 3], [0, 0]], dtype=torch.int32)
     v = torch.tensor([[3.0, 0.0], [0.5, 1.0], [0.0, 0.0]])
     gradients = pulled(3, torch.tensor([0]))
     gradients.means2d.copy_(v)
@@ -199,3 +199,13 @@ def test_statistics_follow_rows_and_return_from_a_checkpoint() -> None:
     other.restore(density.tensors())
     assert torch.equal(other.grad_sum, density.grad_sum)
     assert torch.equal(other.seen, density.seen)
+
+
+@pytest.mark.parametrize(("strength", "count"), [(0.9, 3), (1.1, 4)])
+def test_the_mean_over_the_views_decides_and_not_the_sum(strength: float, count: int) -> None:
+    """Three views of 10 px pull one Gaussian by that share of the threshold each."""
+    model = OptimizedGaussians.start(scene([LARGE] * 3, [0.5] * 3))
+    density = controlled(model)
+    for step in (5, 6, 7):
+        density.after_backward(step, pulled(3, torch.tensor([1]), strength * 1e-3 / 5), seen(3), 10, 10)
+    assert len(density.refine(10, model)) == count

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from gsopt.errors import InputError, UsageError
 from gsopt.formats.ply import save_ply
 from gsopt.raster.api import make_backend
 from gsopt.training.cells import divide as divide_module
+from gsopt.training.cells import size as size_module
 from gsopt.training.cells.divide import divide, ground_axes, relevant, split
 from gsopt.training.cells.plan import Cell, CellPlan, read_plan, sha256
 from gsopt.training.cells.size import cell_sizes, sizes_of
@@ -181,7 +183,7 @@ def test_the_ground_is_at_right_angles_to_the_cameras_common_up(data: Path) -> N
 
 
 def test_a_cell_draws_its_share_of_what_a_view_shows() -> None:
-    weights, wide = torch.tensor([1.0, 3.0, 4.0]), torch.tensor([[True, False, True], [False, True, False]])
+    weights, wide = torch.tensor([0.01, 0.03, 0.04]), torch.tensor([[True, False, True], [False, True, False]])
     assert divide_module._shares(weights, wide).tolist() == pytest.approx([5 / 8, 3 / 8])
     assert divide_module._shares(torch.zeros(3), wide).tolist() == [0, 0]
 
@@ -215,3 +217,64 @@ def test_time_is_estimated_for_the_steps_that_a_stage_takes(data: Path) -> None:
     assert (coarse.iterations, polish.iterations) == (30, 30)
     assert found.coarse.seconds == of_sizes(math.ceil(budget / 2), degree, pixels, 0, coarse.iterations).seconds
     assert found.polish.seconds == of_sizes(budget, degree, pixels, 0, polish.iterations).seconds
+
+
+@pytest.mark.parametrize(("count", "steps"), [(1, 80), (2, 80), (4, 40), (5, 32)])
+def test_a_cell_is_estimated_with_its_margin_and_by_two_cells_per_view(count: int, steps: int, data: Path) -> None:
+    """Eight tenths of 100 steps where all views see it, and three tenths more Gaussians than its own."""
+    config, scene = big(data, iterations=100), load_scene(str(data))
+    plan = RunPlan.of(config, scene)
+    degree, budget, pixels = plan.schedule.max_sh_degree, plan.density.max_gaussians, 24 * 24
+    part = math.ceil(budget / count)
+    found = sizes_of(count, config, plan, scene, None, 7)
+    assert found.count == count
+    assert found.coarse == of_sizes(part, degree, pixels, 7, 30)
+    assert found.cell == of_sizes(math.ceil(1.3 * part), degree, pixels, 7, steps, frozen=part)
+    assert found.polish == of_sizes(budget, degree, pixels, 7, 30, growing=False)
+    assert found.whole == of_sizes(budget, degree, pixels, 7, 100)
+    limits = (None, found.polish.memory, found.polish.memory - 1)
+    polished = [sizes_of(count, config, plan, scene, limit, 7).polished for limit in limits]
+    assert polished == [True, True, False]
+
+
+def test_as_many_cells_as_input_views_are_allowed(data: Path) -> None:
+    assert sizes(big(data, cells="6")).count == 6
+
+
+def test_cells_fit_up_to_the_last_byte_of_the_larger_run() -> None:
+    for coarse, cell in ((700, 800), (800, 700)):
+        pair: Any = SimpleNamespace(coarse=SimpleNamespace(memory=coarse), cell=SimpleNamespace(memory=cell))
+        assert [size_module._fits(pair, limit) for limit in (None, 800, 799)] == [True, True, False]
+
+
+@pytest.mark.parametrize(("polished", "time", "memory"), [(True, "0:01:15", 900), (False, "0:01:10", 800)])
+def test_the_sizes_of_cells_add_up_with_the_polish_only_where_there_is_one(
+    polished: bool, time: str, memory: int
+) -> None:
+    coarse, cell, polish, whole = (
+        SimpleNamespace(memory=memory, seconds=seconds) for memory, seconds in ((700, 10), (800, 20), (900, 5), (1, 2))
+    )
+    found = size_module.Sizes(3, coarse, cell, polish, whole, polished)  # type: ignore[arg-type]
+    assert found.memory == memory
+    assert f", {time} of one core" in str(found)
+    assert ("no joint polish" in str(found)) == (not polished)
+
+
+def test_a_side_leaves_a_twentieth_out_at_either_end() -> None:
+    x = torch.arange(40.0).double()
+    places = torch.stack([x, 3 * x.flip(0)], dim=1)
+    assert divide_module._side(places).tolist() == [37 - 2, 3 * (37 - 2)]
+    assert divide_module._side(places[:19]).tolist() == [18, 54]
+
+
+def test_cells_overlap_by_a_tenth_of_the_narrowest(data: Path) -> None:
+    coarse = cloud(80, 4)
+    found = divide(coarse, "0" * 64, load_scene(str(data)).train, make_backend("cpu", 1), 2, 1000).plan
+    places = found.places(coarse.means)
+    widths = []
+    for cell in found.cells:
+        own = places[cell.holds(places)].sort(dim=0).values
+        cut = len(own) // 20
+        widths.append(own[len(own) - 1 - cut] - own[cut])
+    narrowest = torch.stack(widths).amin(0)
+    assert [cell.margin for cell in found.cells] == [pytest.approx(tuple((narrowest / 10).tolist()))] * 2

@@ -14,7 +14,7 @@ from gsopt.config.train import ExposureConfig, SparseConfig
 from gsopt.data.scene import Scene, load_scene
 from gsopt.raster.backend import RasterSettings, RenderedFrame
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.training.exposure import BETA1, BETA2, EPS, Exposure
+from gsopt.training.exposure import BETA1, Exposure
 from gsopt.training.loop import train
 
 WHITE = torch.ones(3)
@@ -100,7 +100,7 @@ def test_gains_take_adams_steps_at_a_rate_that_falls_by_the_same_factor(dataset:
     assert [found.rate(step) for step in (10, 60, 110)] == pytest.approx([1e-2, 1e-3, 1e-4])
     assert Exposure(config, scene, 10).rate(10) == pytest.approx(1e-2)
     own = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    adam = torch.optim.Adam([own], lr=1.0, betas=(BETA1, BETA2), eps=EPS)
+    adam = torch.optim.Adam([own], lr=1.0, betas=(0.9, 0.99), eps=1e-15)
     expected = torch.zeros(len(scene.train), 3, dtype=torch.float64)
     random = torch.Generator().manual_seed(0)
     for step in (9, 10, 11, 12, 50):

@@ -78,3 +78,29 @@ def test_every_pair_that_looks_alike_is_named_and_then_nothing_else() -> None:
     (apart,) = few_photos._direction_faults(scene(views(0, 90, 200, outward=True)))
     assert "no two show the same object" in apart
     assert list(few_photos._direction_faults(scene(views(0, outward=True)))) == []
+
+
+def test_two_cameras_that_look_apart_show_no_common_object() -> None:
+    (apart,) = few_photos._direction_faults(scene(views(0, 90, outward=True)))
+    assert "no two show the same object" in apart
+
+
+@pytest.mark.parametrize(
+    ("guessed", "body", "colors", "told"),
+    [
+        (False, False, False, few_photos.TURNED),
+        (True, False, False, few_photos.GUESSED),
+        (True, True, False, few_photos.LIKENED),
+        (True, True, True, few_photos.COMPLETED),
+    ],
+)
+def test_a_completed_scene_says_where_its_other_sides_come_from(
+    guessed: bool, body: bool, colors: bool, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(few_photos, "small_photos", lambda train, most: [thumbnail(5000)] * len(train))
+    one = scene(views(0))
+    assert few_photo_warnings(one) == ()
+    one.completed, one.guessed = True, (None,) * guessed
+    one.body, one.body_colors = (object() if given else None for given in (body, colors))
+    assert few_photo_warnings(one) == (told,)
+    assert len({few_photos.TURNED, few_photos.GUESSED, few_photos.LIKENED, few_photos.COMPLETED}) == 4

@@ -55,3 +55,14 @@ def test_distances_do_not_depend_on_the_frame() -> None:
     means = blob(300)
     turned = means[:, [1, 2, 0]] * torch.tensor([-1.0, 1.0, -1.0]) + 5.0
     torch.testing.assert_close(neighbor_distances(turned), neighbor_distances(means), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("farthest", "found"), [(1005.0, False), (1040.0, False), (1041.0, True)])
+def test_where_nearly_all_are_alike_a_deviation_is_a_hundredth_of_the_mean(
+    farthest: float, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 63 at 1000 and one farther out the true deviation is an eighth of what it stands out by."""
+    distances = torch.full((64,), 1000.0)
+    distances[5] = farthest
+    monkeypatch.setattr(floaters, "neighbor_distances", lambda means: distances)
+    assert solitary(torch.zeros(64, 3), sigmas=4.0).nonzero().flatten().tolist() == [5] * found

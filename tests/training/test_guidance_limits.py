@@ -16,9 +16,9 @@ from tiny_scenes import ring
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
 from gsopt.errors import InputError, NumericalError, UsageError
-from gsopt.sds.prompts import Prompt
+from gsopt.sds.prompts import Prompt, write_prompts
 from gsopt.training.guided import guard, references
-from gsopt.training.guided.compare_prompts import Arm, compare_prompts
+from gsopt.training.guided.compare_prompts import Arm, Outcome, compare_prompts
 from gsopt.training.guided.session import RunGuidance, report_counts
 
 
@@ -224,3 +224,40 @@ def test_prompts_are_compared_from_two_views_on_and_with_a_prior_that_takes_word
         compare_prompts(TrainConfig(), given[2], nothing, mute, [none, words], print)
     with pytest.raises(AttributeError):
         compare_prompts(TrainConfig(), given[2], nothing, mute, [none], print)
+
+
+@pytest.mark.parametrize(
+    ("sides", "named", "warned"),
+    [(("all", "front"), None, True), (("all", "top"), None, False), (("back", "all"), 0, False), ((), None, False)],
+)
+def test_prompts_for_one_side_ask_for_a_named_front(
+    sides: tuple[Any, ...], named: int | None, warned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was encoded is saved beside the prompts, and its notes are told."""
+    prompts, told, saved = [Prompt("a chair", view=side) for side in sides], [], []
+    made = SimpleNamespace(prompts=prompts, notes=("a note",), save=saved.append)
+    monkeypatch.setattr(references, "read_guidance_prompts", lambda config: prompts)
+    monkeypatch.setattr(references, "encoded", lambda *_: made)
+    scene: Any = SimpleNamespace(train=[SimpleNamespace(name="a.png")])
+    prior: Any = SimpleNamespace(size=8)
+    folder = tmp_path / "guidance"
+    found = references.make_conditioning(GuidanceConfig(front_view=named), scene, prior, folder, told.append)
+    assert found is made
+    assert saved == [folder / "conditioning.safetensors"]
+    assert (folder / "prompts.json").is_file()
+    assert told[0] == "a note"
+    assert [("a.png is taken for it" in text) for text in told[1:]] == [True] * warned
+
+
+def test_prompts_are_those_of_the_flags_then_those_of_the_file(tmp_path: Path) -> None:
+    write_prompts(tmp_path / "prompts.json", [Prompt("an oak chair", source="template")])
+    config = GuidanceConfig(prior="sd21", prompt=("a", "b"), negative=("c",), prompts=str(tmp_path / "prompts.json"))
+    found = references.read_guidance_prompts(config)
+    assert [(one.text, one.polarity) for one in found] == [
+        ("a", "positive"), ("b", "positive"), ("c", "negative"), ("an oak chair", "positive"),
+    ]  # fmt: skip
+
+
+def test_the_mean_of_an_arm_is_that_of_its_views() -> None:
+    assert Outcome(Arm("a", ()), (20.0, 23.0, 26.0), (), None).mean == pytest.approx(23.0)
+    assert Arm("a", ()).weight == 0.2

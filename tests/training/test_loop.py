@@ -6,6 +6,8 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -280,3 +282,37 @@ def test_the_speed_is_a_mean_of_recent_speeds_that_follows_a_change(monkeypatch:
     assert 0.5 < found[6] < 10
     assert found[6:] == sorted(found[6:], reverse=True)
     assert found[-1] == pytest.approx(0.5, rel=0.05)
+
+
+def test_every_hundredth_step_checks_that_all_is_finite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Steps:
+        """A run of 250 steps that does nothing else."""
+
+        plan = SimpleNamespace(preview_every=0, checkpoint_every=0)
+        step = 0
+
+        @property
+        def finished(self) -> bool:
+            return self.step == 250
+
+        def advance(self) -> tuple[float, str]:
+            self.step += 1
+            return 0.5, "a.png"
+
+    checked: list[int] = []
+    monkeypatch.setattr(loop, "_check_finite", lambda steps, directory: checked.append(steps.step))
+    monkeypatch.setattr(loop, "_report_progress", lambda *_: None)
+    directory: Any = SimpleNamespace(checkpoints=tmp_path)
+    clock: Any = SimpleNamespace(is_due=lambda: False)
+    assert not loop._advance(Steps(), directory, False, clock)  # type: ignore[arg-type]
+    assert checked == [100, 200]
+
+
+def test_every_repaired_mask_is_recorded_and_told() -> None:
+    masks: Any = [SimpleNamespace(about=f"mask {i}", to_dict=lambda i=i: {"mask": i}) for i in range(2)]
+    recorded: dict[str, Any] = {}
+    told: list[str] = []
+    directory: Any = SimpleNamespace(record=lambda **fields: recorded.update(fields), warn=told.append)
+    loop._report_masks(masks, directory)
+    assert recorded == {"repaired_masks": [{"mask": 0}, {"mask": 1}]}
+    assert told == ["mask 0", "mask 1"]

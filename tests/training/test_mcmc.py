@@ -154,3 +154,52 @@ def test_rows_are_drawn_in_proportion_to_their_weights() -> None:
     counts = torch.bincount(draw(weights, 80_000, torch.Generator().manual_seed(0)), minlength=6)
     assert counts[[0, 3, 5]].sum() == 0
     torch.testing.assert_close(counts / 10_000, weights, rtol=0, atol=0.1)
+
+
+def test_one_stands_for_51_copies_at_most_and_each_for_its_own_number() -> None:
+    o = torch.full((4,), 0.9, dtype=torch.float64)
+    new, factor = shared(o, torch.tensor([50, 51, 52, 900]))
+    assert new[0] > new[1] == new[2] == new[3]
+    assert factor[0] != factor[1] == factor[2] == factor[3]
+    for count in (50, 51):
+        alone = shared(o[:1], torch.tensor([count]))
+        assert (float(new[count - 50]), float(factor[count - 50])) == pytest.approx((float(alone[0]), float(alone[1])))
+    mixed = shared(o[:3], torch.tensor([1, 2, 7]))[1]
+    assert mixed.tolist() == pytest.approx([paper_factor(0.9, n) for n in (1, 2, 7)])
+
+
+def test_what_is_fully_opaque_is_shared_as_if_a_ten_millionth_shone_through() -> None:
+    new, factor = shared(torch.ones(1, dtype=torch.float64), torch.tensor([2]))
+    assert float(new) == pytest.approx(1 - math.sqrt(1e-7))
+    assert float(factor) == pytest.approx(paper_factor(1 - 1e-7, 2))
+
+
+def noise_of(opacities: list[float]) -> torch.Tensor:
+    """Moves of one Gaussian in copies with these opacities."""
+    one = cloud(1, seed=3).select(torch.zeros(len(opacities), dtype=torch.int64))
+    start = replace(one, logit_opacities=torch.logit(torch.tensor(opacities)))
+    model = OptimizedGaussians.start(start)
+    controlled().after_step(model, lr_means=1.0)
+    return model.gaussians.means - start.means
+
+
+def test_noise_fades_with_opacity_and_ends_at_a_tenth() -> None:
+    """By the logistic function of -100 (o - 0.005): 1/2 at 0.005, 1/(1 + e^2) at 0.025."""
+    faint, fainter = noise_of([0.025] * 3), noise_of([0.005] * 3)
+    torch.testing.assert_close(faint / fainter, torch.full((3, 3), 2 / (1 + math.exp(2))), rtol=1e-3, atol=0)
+    assert noise_of([0.099, 0.101]).any(dim=1).tolist() == [True, False]
+
+
+def test_an_opacity_at_the_limit_is_dead() -> None:
+    gaussians = cloud(40, seed=1)
+    logits = torch.full((40,), -3.0)
+    logits[:10] = 1.0
+    limit = float(logits.sigmoid()[-1])
+    model = OptimizedGaussians.start(replace(gaussians, logit_opacities=logits))
+    refined = controlled(replace(CONFIG, prune_opacity=limit, max_gaussians=40)).refine(10, model)
+    assert bool((refined.gaussians.means[10:, None] == gaussians.means[:10]).all(-1).any(dim=1).all())
+
+
+def test_the_last_row_is_drawn_by_its_weight_too() -> None:
+    rows = draw(torch.tensor([1.0, 1.0, 6.0]), 8000, torch.Generator().manual_seed(0))
+    assert (torch.bincount(rows, minlength=3) / 1000).tolist() == pytest.approx([1, 1, 6], abs=0.15)

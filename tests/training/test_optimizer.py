@@ -88,3 +88,12 @@ def test_forgetting_zeroes_the_moments_of_these_rows_only() -> None:
             expected[[1, 4]] = 0
             assert torch.equal(tensor, expected)
     assert torch.equal(model.gaussians.means, untouched.gaussians.means)
+
+
+def test_a_share_of_the_rates_leaves_that_of_the_means_as_it_is() -> None:
+    config = OptimizerConfig(lr_means=1.0, lr_quats=0.5, lr_shN=0.25)
+    whole, half = learning_rates(config, 0.125), learning_rates(config, 0.125, 0.5)
+    assert whole.keys() == half.keys() == set(PARAMETERS)
+    assert (whole["quats"], half["quats"], half["shN"]) == (0.5, 0.25, 0.125)
+    assert half["sh0"] == pytest.approx(config.lr_sh0 / 2)
+    assert whole["means"] == half["means"] == 0.125

@@ -13,7 +13,7 @@ from gsopt.config.train import PoseConfig
 from gsopt.geometry.rigid_motion import rigid_motion
 from gsopt.raster.backend import Gradients
 from gsopt.training import poses
-from gsopt.training.poses import BETA1, BETA2, DAMPING, PoseRefinement, pose_gradient, whitening
+from gsopt.training.poses import BETA1, BETA2, PoseRefinement, pose_gradient, whitening
 
 
 def skew(omega: torch.Tensor) -> torch.Tensor:
@@ -51,9 +51,7 @@ def test_whitened_motions_shift_the_picture_alike() -> None:
     J = torch.stack([(seen(unit) - seen(-unit)) / 2e-6 for unit in units], dim=2)
     S = torch.einsum("nic,nid->cd", J, J) / len(J)
     W = whitening(viewmat, means)
-    torch.testing.assert_close(
-        W @ (S + DAMPING * torch.diag(S.diagonal())) @ W, torch.eye(6).double(), atol=1e-6, rtol=0
-    )
+    torch.testing.assert_close(W @ (S + 0.01 * torch.diag(S.diagonal())) @ W, torch.eye(6).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(W, W.T)
     median = float(points[:, 2].median())
     world = torch.linalg.inv(viewmat)
@@ -144,7 +142,7 @@ def test_a_state_of_another_shape_is_refused() -> None:
 
 def test_a_camera_stands_where_its_pose_was_learned() -> None:
     found = refinement()
-    found.viewmats[2, 1, 3] += 1
-    camera = ring(3, 1.0)[2]
-    assert torch.equal(found.camera(2, camera).viewmats[0], found.viewmats[2].to(camera.viewmats))
-    assert found.camera(2, camera).viewmats.dtype == camera.viewmats.dtype
+    found.viewmats[1, 1, 3] += 1
+    camera = ring(3, 1.0)[1]
+    assert torch.equal(found.camera(1, camera).viewmats, found.viewmats[1][None].to(camera.viewmats))
+    assert found.camera(1, camera).viewmats.dtype == camera.viewmats.dtype

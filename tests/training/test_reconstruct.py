@@ -20,6 +20,7 @@ from gsopt.config.train import DataConfig, TrainConfig
 from gsopt.errors import GsoptError, InputError, MissingDependency, SettingError, UsageError
 from gsopt.events import read_events
 from gsopt.results.evaluation import read_metrics
+from gsopt.training.reconstruct import _absolute
 
 SHORT: dict[str, Any] = {
     "iterations": 4,
@@ -219,3 +220,13 @@ def test_a_missing_dataset_is_an_error_of_gsopt(tmp_path: Path) -> None:
     for data, resume in ((None, False), (None, True), (tmp_path / "absent", False)):
         with pytest.raises(GsoptError):
             gsopt.reconstruct(data, tmp_path / "run", resume=resume)
+
+
+def test_what_exists_becomes_absolute_and_no_name_stays_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path)
+    names = ("", "here", "library:here", "shape:here", "sd21", "library")
+    here = str(tmp_path / "here")
+    assert [_absolute(name) for name in names] == [
+        "", here, f"library:{here}", f"shape:{here}", "sd21", "library",
+    ]  # fmt: skip

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_scenes import ring
 
-from gsopt.training.running_means import PSNR_EVERY, RunningMeans
+from gsopt.training.running_means import RunningMeans
 from gsopt.training.targets import Target
 
 BLACK = Target(ring(1, 0.5), torch.zeros(2, 2, 3), None, (2, 2))
@@ -32,15 +32,22 @@ def test_a_mean_arrives_where_the_values_stay() -> None:
     assert means.loss == pytest.approx(0.25, abs=1e-6)
 
 
+def test_a_value_moves_the_mean_a_twentieth_of_the_way() -> None:
+    means = RunningMeans()
+    for loss in (1.0, 0.0, 0.95):
+        means.update(2, loss, BLACK.colors, BLACK)
+    assert means.loss == pytest.approx(0.95)
+
+
 def test_the_error_is_measured_at_the_first_step_and_every_tenth() -> None:
     means = RunningMeans()
     assert means.psnr is None
     measured = []
-    for step in range(1, 2 * PSNR_EVERY + 2):
+    for step in range(1, 22):
         before = means.mse
         means.update(step, 0.0, torch.full((2, 2, 3), 0.1 * step), BLACK)
         measured += [step] if means.mse != before else []
-    assert measured == [1, 1 + PSNR_EVERY, 1 + 2 * PSNR_EVERY]
+    assert measured == [1, 11, 21]
 
 
 @pytest.mark.parametrize(("level", "psnr"), [(0.1, 20.0), (1.0, 0.0), (0.0, 100.0)])

@@ -190,7 +190,7 @@ def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
 
 
 @pytest.mark.parametrize(
-    ("views", "images", "drawn"), [(4, 4, 4), (4, 24, 8), (8, 8, 4), (8, 48, 4), (16, 16, 2), (5, 0, 0)]
+    ("views", "images", "drawn"), [(4, 4, 4), (4, 24, 8), (6, 48, 5), (8, 8, 4), (8, 48, 4), (16, 16, 2), (5, 0, 0)]
 )
 def test_the_more_photos_the_fewer_mirror_images(views: int, images: int, drawn: int) -> None:
     scene = SimpleNamespace(train=(None,) * views, mirrored=(None,) * images, completed=False)
@@ -205,3 +205,55 @@ def test_the_last_eighth_is_averaged_where_nothing_is_added_in_it(iterations: in
     assert run.averages_after == iterations - round(iterations / 8)
     assert replace(run, refine_stop=iterations - 1).averages_after == iterations - 1
     assert replace(run, coarse_until=(5, iterations - 2)).averages_after == iterations - 2
+
+
+def test_settings_that_are_left_open_are_those_of_decision_19() -> None:
+    """docs/decisions/0019-fewer-steps.md; mcmc refines as with few views."""
+    config, mcmc = TrainConfig(), TrainConfig(density=DensityConfig(strategy="mcmc"))
+    many = {"lr_means": 3.2e-4, "lr_quats": 4e-3, "lr_shN": 5e-4, "sh_degree_every": 500}
+    few = {"lr_means": 1.6e-4, "lr_quats": 1e-3, "lr_shN": 2.5e-4, "sh_degree_every": 1000}
+    assert [plan.by_views(config.optimizer, sparse) for sparse in (False, True)] == [many, few]
+    growth = {"refine_start": 200, "refine_every": 50, "grow_grad2d": 1e-4, "turnover": 0.2}
+    rare = {"refine_start": 500, "refine_every": 100, "grow_grad2d": 2e-4, "turnover": 0.0}
+    assert [plan.growth_settings(config.density, sparse) for sparse in (False, True)] == [growth, rare]
+    assert plan.growth_settings(mcmc.density, sparse=False) == rare
+    assert (made(config).refine_every, made(mcmc).refine_every) == (50, 100)
+
+
+@pytest.mark.parametrize(("views", "window"), [(1, 100), (30, 120), (99, 198), (100, 100), (101, 101)])
+def test_a_window_of_losses_is_of_whole_epochs_and_at_least_100_steps(views: int, window: int) -> None:
+    assert Flatness.of(views).window == window
+
+
+@pytest.mark.parametrize(("fall", "end"), [(0.003, None), (0.0021, None), (0.0019, 6), (0.0, 6)])
+def test_five_windows_without_a_fall_of_a_500th_end_a_run(fall: float, end: int | None) -> None:
+    flat = Flatness(window=1)
+    ends = (window for window in range(1, 12) if flat.update((1 - fall) ** window))
+    assert next(ends, None) == end
+
+
+def test_a_floater_stands_out_by_four_deviations_at_first_and_by_two_at_last() -> None:
+    run = made(TrainConfig(iterations=300))
+    assert [run.floater_sigmas(step) for step in (0, 150, 300)] == pytest.approx([4.0, 3.0, 2.0])
+
+
+def test_the_last_reset_is_in_the_last_refinement_or_2000_steps_before_the_end() -> None:
+    def resets(iterations: int, every: int) -> list[int]:
+        run = made(TrainConfig(iterations=iterations, density=DensityConfig(reset_every=every)))
+        return [step for step in range(1, iterations + 1) if run.resets(step)]
+
+    assert resets(4000, 1000) == [1000, 2000]
+    assert resets(10_000, 2000) == [2000, 4000, 6000]  # refinement ends with step 6000
+    assert resets(4000, 0) == []
+
+
+def test_a_rate_that_ends_at_zero_is_zero_from_the_first_step() -> None:
+    run = made(TrainConfig(iterations=10, optimizer=OptimizerConfig(lr_means_final=0.0)))
+    assert [run.lr_means(step) for step in (0, 5)] == [0.0, 0.0]
+
+
+def test_a_run_that_adds_nothing_is_settled_from_its_first_step() -> None:
+    run = replace(made(TrainConfig()), refine_stop=0, coarse_until=())
+    assert [run.is_settled(step) for step in (0, 1)] == [False, True]
+    assert [replace(run, refine_stop=7).is_settled(step) for step in (7, 8)] == [False, True]
+    assert [replace(run, coarse_until=(3, 9)).is_settled(step) for step in (9, 10)] == [False, True]

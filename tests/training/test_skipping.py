@@ -213,3 +213,27 @@ def test_every_eighth_step_draws_the_whole_image(dataset: Path, monkeypatch: pyt
     monkeypatch.setattr(Trainer, "_gradients", note)
     passed_steps(dataset, ScheduleConfig(coarse_until=(), crop_masked=True))
     assert [i + 1 for i, size in enumerate(seen) if size == SIZE * SIZE] == [8, 16, 24]
+
+
+def test_the_ratio_is_that_of_squared_correlations_to_chance_over_gaussians_seen_twice() -> None:
+    """By the formula of `Bands`, one Gaussian at a time: seen in two, three, one and no views."""
+    gaussians, cameras = cloud(4, seed=2), ring(3, 1.0).to(torch.float32)
+    views = {0: (0, 2), 1: (0, 1, 2), 2: (1,), 3: ()}
+    generator, nothing = torch.Generator().manual_seed(7), torch.zeros(4, 1, 3)
+    for degree in (0, 1):
+        bands, colors = Bands(every=3, highest=3), torch.randn(3, 4, 3, generator=generator)
+        bands.degree = degree
+        for i in range(3):
+            seen = torch.tensor([i in views[row] for row in range(4)])
+            v = sh.C0 * torch.where(seen[:, None], colors[i], 0.0)[:, None]
+            bands.note(gaussians, cameras[i], Gradients(nothing, nothing, nothing, nothing, v, nothing, nothing, None))
+        found = expected = 0.0
+        for row in (0, 1):
+            own = list(views[row])
+            directions = torch.nn.functional.normalize(gaussians.means[row] - cameras.centers[own], dim=1)
+            Y = sh.basis(directions, degree + 1)[:, (1, 4)[degree] :]
+            Y, g = Y - Y.mean(0), colors[own, row]
+            found += float((Y.T @ g).square().sum())
+            expected += float(Y.square().sum() * g.var(0).sum())
+        assert bands.ratio() == pytest.approx(found / expected, rel=1e-3)
+        assert bands.tensors()["n"].tolist() == [2, 3, 1, 0]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +16,7 @@ from tiny_scenes import tiny_config
 
 from gsopt.config.train import DataConfig, SparseConfig
 from gsopt.data.scene import Scene, load_scene
+from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import find_focus
 from gsopt.init.first_gaussians import first_gaussians
 from gsopt.raster.api import make_backend
@@ -68,6 +72,37 @@ def test_the_cameras_surround_what_the_photos_look_at(scene: Scene, unseen: Unse
     assert math.gcd(TURN, COUNT) == 1  # else some cameras never take their turn
 
 
+def test_the_term_asks_for_an_opacity_of_four_fifths() -> None:
+    """It pulls neither way there, and falls off linearly: weight 0.3 over two pixels."""
+    found = haze_gradient(torch.tensor([[0.8, 0.0]], dtype=torch.float64), 0.3)
+    assert found.tolist() == [[pytest.approx(0.0), pytest.approx(0.3 * 0.8)]]
+
+
+def test_sixteen_cameras_take_turns_every_second_step_seven_apart(unseen: UnseenViews) -> None:
+    """From three tenths of the run on; each once before any comes again, and the nearest not one after the other."""
+    asked: list[torch.Tensor] = []
+    steps: list[int] = []
+
+    class Asked(Exception):
+        pass
+
+    def forward(gaussians: object, camera: Cameras, *_: object) -> None:
+        asked.append(camera.centers[0])
+        raise Asked
+
+    backend: Any = SimpleNamespace(forward=forward)
+    nothing: Any = None
+    for step in range(1, 62):
+        try:
+            unseen.add(step, nothing, backend, nothing)
+        except Asked:
+            steps.append(step)
+    assert steps == list(range(30, 62, 2))
+    rows = [int((unseen.cameras.centers - center).norm(dim=1).argmin()) for center in asked]
+    assert sorted(rows) == list(range(16))
+    assert {(b - a) % 16 for a, b in itertools.pairwise(rows)} == {7}
+
+
 def test_thin_matter_fades(scene: Scene, unseen: UnseenViews) -> None:
     gaussians, _ = first_gaussians(scene, replace(tiny_config(Path("."), iterations=1).init, count=800), 0, seed=0)
     thin = replace(gaussians, logit_opacities=torch.full((len(gaussians),), -4.0))
@@ -88,7 +123,7 @@ def test_the_photos_come_first_and_steps_between_are_free(scene: Scene, unseen: 
 
 def test_one_photo_many_photos_scenes_without_masks_and_a_weight_of_zero_do_without(scene: Scene) -> None:
     assert UnseenViews.of(replace(scene, train=scene.train * 2), 0.1, STEPS) is not None
-    assert UnseenViews.of(replace(scene, train=scene.train * 3), 0.1, STEPS) is None
+    assert UnseenViews.of(replace(scene, train=scene.train * 2 + scene.train[:1]), 0.1, STEPS) is None
     assert UnseenViews.of(scene, 0.0, STEPS) is None
     assert UnseenViews.of(replace(scene, train=scene.train[:1]), 0.1, STEPS) is None
     assert UnseenViews.of(replace(scene, has_alpha=False), 0.1, STEPS) is None

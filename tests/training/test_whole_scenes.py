@@ -50,6 +50,15 @@ def test_the_average_is_the_mean_of_what_it_noted_beside_each_gaussian() -> None
         copy.restore(average.tensors(), seen[3])
 
 
+def test_every_tenth_step_after_the_first_is_averaged() -> None:
+    average, seen, counts = RunningAverage(first=20), cloud(2, seed=1), []
+    for step in range(1, 61):
+        before = average.count
+        average.note(step, seen)
+        counts += [step] if average.count > before else []
+    assert counts == [30, 40, 50, 60]
+
+
 def test_a_run_on_a_whole_scene_hands_on_the_mean_of_its_last_steps(dataset: Path, tmp_path: Path) -> None:
     """The last Gaussians stay in the checkpoint, to go on from; those of objects are handed on."""
     small = {"init": InitConfig(method="random", count=60), "iterations": 160}
