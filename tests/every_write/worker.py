@@ -166,7 +166,6 @@ def prepare() -> None:
         for name in IMPORTED_BY_JOBS:
             importlib.import_module(name)
         Image.init()
-        train_flags._help = functools.cache(train_flags._help)  # reads the sources
         train_flags.parse(["scene"])
         evaluation.Lpips = functools.cache(evaluation.Lpips)  # type: ignore[attr-defined]
         evaluation.networks()
