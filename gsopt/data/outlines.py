@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gsopt.data.distances import squared_distance
@@ -54,7 +54,7 @@ class Outline:
         solid = self.alpha[0] > 0.5
         beside = torch.nn.functional.max_pool2d((~solid)[None, None].float(), 3, 1, padding=1)[0, 0] > 0
         edge = torch.nonzero(solid & beside)
-        edge = edge[:: max(1, math.ceil(len(edge) / PIXELS_PER_PHOTO))]
+        edge = edge[_around(edge)][:: max(1, math.ceil(len(edge) / PIXELS_PER_PHOTO))]
         row, column = (edge + 0.5).unbind(1)
         for _ in range(2):
             here = self.here(column, row)
@@ -66,6 +66,12 @@ class Outline:
     def _slope(self, column: Tensor, row: Tensor, across: float, down: float) -> Float[Tensor, "R"]:
         """Difference of the signed distance over one pixel."""
         return self.here(column + across, row + down) - self.here(column - across, row - down)
+
+
+def _around(places: Int64[Tensor, "R 2"]) -> Int64[Tensor, "R"]:
+    """Their order around their middle. Row by row, every second one would often be that on the left."""
+    down, across = (places - places.double().mean(0)).unbind(1)
+    return torch.atan2(down, across).argsort(stable=True)
 
 
 def signed_distance(alpha: Float[Tensor, "1 H W"], finer: int) -> Float[Tensor, "1 FH FW"]:

@@ -109,6 +109,18 @@ def test_errors_are_degrees_and_shares_of_the_path() -> None:
     assert error.position[:4].tolist() == pytest.approx([0.05] * 4, rel=0.02)
 
 
+def test_turns_are_compared_in_the_median_pair_and_need_no_common_axes() -> None:
+    """Of three cameras the third is turned otherwise by 40 degrees: in two of three pairs."""
+    first = viewmats(np.zeros((3, 3)), np.stack([turn(0), turn(10), turn(30)]))
+    second = viewmats(np.ones((3, 3)), np.stack([turn(0), turn(10), turn(70)]))
+    assert trajectory.turns_apart(first, second) == pytest.approx(40)
+    second[:, :3, :3] = second[:, :3, :3] @ turn(77, axis=0)
+    assert trajectory.turns_apart(first, second) == pytest.approx(40)
+    assert trajectory.turns_apart(first[:2], second[:2]) == pytest.approx(0, abs=1e-5)
+    assert trajectory.turns_apart(first[1:], second[1:]) == pytest.approx(40)
+    assert trajectory.turns_apart(first[:1], second[:1]) == 0
+
+
 def path(*motions: float, sharpness: tuple[float, ...] = ()) -> list[FrameMeasurement]:
     sharp = sharpness or (1.0,) * len(motions)
     return [FrameMeasurement(i, i / 30, s, m) for i, (m, s) in enumerate(zip(motions, sharp, strict=True))]

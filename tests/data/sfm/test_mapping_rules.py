@@ -254,6 +254,7 @@ def test_few_photos_are_mapped_with_the_lens_held(tmp_path: Path) -> None:
         assert not options.triangulation.ignore_two_view_tracks
         assert (options.min_num_matches, options.mapper.init_min_num_inliers) == (18, 18)
         assert (options.mapper.abs_pose_min_num_inliers, options.num_threads, options.random_seed) == (15, 1, 5)
+        assert (options.mapper.init_min_tri_angle, options.mapper.abs_pose_min_inlier_ratio) == (6.0, 0.25)
         assert getattr(options, "init_image_id1", None) == (first and first[0])
         assert getattr(options, "init_image_id2", None) == (first and first[1])
 
@@ -286,7 +287,9 @@ def test_a_reconstruction_that_grew_by_a_photo_is_taken(
     verified: list[Any] = []
     monkeypatch.setattr(few_photos, "verify", lambda project, pairs, model, only: verified.append(only))
     found = [] if count is None else [Reconstruction(list(range(1, count + 1)), [])]
-    monkeypatch.setattr(few_photos, "_mapped", lambda project, first, start: found if first is None else [])
+    monkeypatch.setattr(
+        few_photos, "_mapped", lambda project, first, start: found if first is None and any(start.iterdir()) else []
+    )
     monkeypatch.setattr(few_photos, "bundle_adjusted", lambda project, model, lens: (model, lens))
     monkeypatch.setattr(few_photos, "with_guided_matches", lambda project, pairs, model: ("guided", model))
     project: Any = SimpleNamespace(database=tmp_path / "a.db")

@@ -131,3 +131,156 @@ def test_large_photos_are_compared_reduced(tmp_path: Path) -> None:
 )
 def test_a_sixth_of_the_pairs_and_at_least_two_refute_poses(compared: int, contradicted: int, wrong: bool) -> None:
     assert Agreement(compared, contradicted).contradicts == wrong
+
+
+def photo(
+    pixels: np.ndarray, center: tuple[float, float, float] = (0, 0, -4), sees: int = 1, scale: float = 1.0
+) -> Any:
+    """A photo with a focal length of 128 px that looks along z: all its positions are exact."""
+    height, width = pixels.shape
+    lens = [128.0, 128.0, width / scale / 2, height / scale / 2]
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=int(width / scale), height=int(height / scale), params=lens, camera_id=1
+    )
+    pose = np.column_stack([np.eye(3), -np.array(center, dtype=float)])
+    gray = torch.from_numpy(pixels.astype(np.float32))[None]
+    return photo_agreement._Photo(gray, camera, scale, pose, np.ones(sees, bool))
+
+
+def test_a_point_is_shown_where_a_patch_around_it_is_inside_the_picture() -> None:
+    """Eight px from each edge, at any depth before the camera."""
+    shown = photo(np.zeros((300, 400)), center=(0, 0, 0))
+    pixels = np.array([[8, 150], [7.5, 150], [392, 150], [392.5, 150], [200, 8], [200, 7.5], [200, 292], [200, 292.5]])
+    for depth in (0.5, 4.0):
+        points = np.column_stack([(pixels - [200, 150]) / 128, np.ones(8)]) * depth
+        found, inside = shown.project(points)
+        assert found.tolist() == pixels.tolist()
+        assert inside.tolist() == [True, False] * 4
+    assert not shown.project(np.array([[0.0, 0, -1], [0, 0, 0]]))[1].any()
+
+
+@pytest.mark.parametrize(
+    ("degrees", "ratio", "alike"), [(24.8, 1, True), (25.2, 1, False), (0, 1.59, True), (0, 1.61, False)]
+)
+def test_two_photos_show_a_point_alike_from_one_side_and_one_distance(
+    degrees: float, ratio: float, alike: bool
+) -> None:
+    """Up to 25 degrees apart, and up to 1.6 times as far."""
+    x, z = 4 * ratio * np.sin(np.radians(degrees)), 4 * ratio * np.cos(np.radians(degrees))
+    one, other = (photo(np.zeros((600, 800)), center) for center in ((0, 0, -4), (float(x), 0, -float(z))))
+    point = np.zeros((1, 3))
+    assert photo_agreement._shown_alike(one, other, point).tolist() == [alike]
+    assert photo_agreement._shown_alike(other, one, point).tolist() == [alike]
+
+
+@pytest.mark.parametrize(
+    ("third", "depth", "hidden"), [(79.5, 3.5, True), (80.0, 3.5, False), (20.0, 3.59, True), (20.0, 3.6, False)]
+)
+def test_three_points_within_80_px_and_before_nine_tenths_of_its_depth_hide_a_point(
+    third: float, depth: float, hidden: bool
+) -> None:
+    """However many others lie farther away."""
+    shown = photo(np.zeros((300, 400)), center=(0, 0, 0))
+    near = np.array([[0, 0, 1.0], [10 / 128, 0, 1], [0, third / 128, 1]]) * depth
+    far = np.array([[1, 1, 1.0], [-1, 1, 1], [-1, -1, 1]]) * 9
+    for seen in (near, np.concatenate([far, near])):
+        assert photo_agreement._hidden(shown, np.array([[0, 0, 4.0]]), seen).tolist() == [hidden]
+
+
+def slope(along: int, steepness: float) -> np.ndarray:
+    """Gray values that rise along an axis of the picture by so much per px."""
+    return 100 + steepness * np.indices((300, 400))[1 - along]
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_a_patch_has_eleven_samples_within_eight_px_and_a_deviation_of_three_gray_levels(along: int) -> None:
+    """Of n samples from -1 to 1 the variance is (n + 1) / (3 (n - 1))."""
+    least = 3 / (8 * np.sqrt(12 / 30))
+    point, normal = np.zeros((1, 3)), np.array([[0, 0, 1.0]])
+    rich = photo(slope(along, 5.0))
+    for steepness, shown in ((1.003 * least, True), (0.997 * least, False)):
+        poor = photo(slope(along, steepness))
+        found = photo_agreement._of_patches(poor, rich, point, normal)
+        assert np.isfinite(found).tolist() == [shown]
+        assert not shown or found == pytest.approx([1], abs=1e-5)
+        assert photo_agreement._of_patches(rich, poor, point, normal) == pytest.approx([1], abs=1e-4)
+    falling, black = photo(slope(along, -1.0)), photo(np.zeros((300, 400)))
+    assert photo_agreement._of_patches(rich, falling, point, normal) == pytest.approx([-1], abs=1e-5)
+    assert photo_agreement._of_patches(rich, black, point, normal).tolist() == [0]
+
+
+def test_a_patch_keeps_its_width_where_its_plane_is_tilted_or_the_photo_is_reduced() -> None:
+    """By 60 degrees, about the axis from left to right."""
+    tilted = np.array([[0, np.sin(np.radians(60)), np.cos(np.radians(60))]])
+    rising = photo(slope(0, 1.0))
+    assert photo_agreement._of_patches(rising, rising, np.zeros((1, 3)), tilted) == pytest.approx([1], abs=1e-5)
+    reduced = photo(slope(0, 0.6), scale=0.5)  # shown above 0.593 per px, whatever the size of the original
+    found = photo_agreement._of_patches(reduced, reduced, np.zeros((1, 3)), np.array([[0, 0, 1.0]]))
+    assert found == pytest.approx([1], abs=1e-4)
+    reduced = photo(slope(0, 0.585), scale=0.5)
+    assert np.isnan(photo_agreement._of_patches(reduced, reduced, np.zeros((1, 3)), np.array([[0, 0, 1.0]]))).all()
+
+
+def test_a_point_and_its_eleven_neighbors_span_the_plane_of_its_patch() -> None:
+    generator = np.random.default_rng(0)
+    plane = np.column_stack([generator.uniform(-1, 1, (12, 2)), np.zeros(12)])
+    others = generator.uniform(-1, 1, (20, 3)) + np.array([0, 5, 9])
+    normals = photo_agreement._normals(np.concatenate([plane, others]))
+    assert np.abs(normals[:12]) == pytest.approx(np.tile([0, 0, 1.0], (12, 1)), abs=1e-9)
+
+
+def two_photos(folder: Path, count: int, plain: int) -> Any:
+    """Two equal photos from one place; features of the first one see the points, `plain` of which show nothing."""
+    generator = np.random.default_rng(1)
+    pixels = generator.integers(0, 256, (300, 400), dtype=np.uint8)
+    pixels[:, 200:] = 128
+    found = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", width=400, height=300, params=[128.0, 128.0, 200.0, 150.0], camera_id=1)
+    found.add_camera_with_trivial_rig(camera)
+    keypoints = np.column_stack([generator.uniform(20, 180, count), generator.uniform(20, 280, count)])
+    keypoints[:plain, 0] += 200
+    for number, name in enumerate(("a.png", "b.png"), 1):
+        Image.fromarray(pixels).save(folder / name)
+        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=1, image_id=number)
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for row, (x, y) in enumerate(keypoints):
+        track = pycolmap.Track()
+        track.add_element(1, row)
+        found.add_point3D(np.array([(x - 200) / 32, (y - 150) / 32, 4.0]), track)
+    return found
+
+
+@pytest.mark.parametrize(("count", "plain", "compared"), [(30, 0, True), (29, 0, False), (31, 1, True), (31, 2, False)])
+def test_thirty_patches_that_show_something_compare_two_photos(
+    count: int, plain: int, compared: bool, tmp_path: Path
+) -> None:
+    found = list(correlations(two_photos(tmp_path, count, plain), tmp_path))
+    assert found == ([("a.png", "b.png", pytest.approx(1, abs=1e-4))] if compared else [])
+
+
+def test_of_too_many_points_every_second_one_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = two_photos(tmp_path, 59, 0)
+    for most, compared in ((59, True), (58, True), (29, False)):
+        monkeypatch.setattr(photo_agreement, "MAX_POINTS", most)
+        assert bool(list(correlations(found, tmp_path))) == compared
+    monkeypatch.setattr(photo_agreement, "MAX_POINTS", 57)
+    found.delete_point3D(1)
+    assert not list(correlations(found, tmp_path))
+
+
+def test_two_photos_contradict_each_other_below_a_correlation_of_a_quarter(monkeypatch: pytest.MonkeyPatch) -> None:
+    medians = [("a", "b", 0.25), ("b", "a", 0.2499), ("a", "c", -1.0), ("c", "a", 0.9)]
+    monkeypatch.setattr(photo_agreement, "correlations", lambda *_: iter(medians))
+    assert agreement(None, Path()) == Agreement(4, 2)
+
+
+@pytest.mark.parametrize(
+    ("size", "compared"), [((1600, 1200), (600, 800)), ((600, 900), (800, 533)), ((800, 90), (90, 800))]
+)
+def test_photos_are_compared_at_800_px_at_most(
+    size: tuple[int, int], compared: tuple[int, int], tmp_path: Path
+) -> None:
+    Image.new("RGB", size, (90, 90, 90)).save(tmp_path / "a.png")
+    gray = photo_agreement._gray(tmp_path / "a.png")
+    assert tuple(gray.shape) == (1, *compared)
+    assert gray.unique().tolist() == [90]
