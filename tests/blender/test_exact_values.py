@@ -17,7 +17,7 @@ from made_splats import random_splats
 
 from blender_addon.core import cameras, colmap, files, ply, splats, units
 from blender_addon.core.errors import InputError
-from blender_addon.core.harmonics import HARMONICS
+from blender_addon.core.harmonics import C0, HARMONICS
 from blender_addon.core.statistics import Filter, bars, outliers, summary
 
 UNIT = np.eye(4).tolist()
@@ -301,5 +301,6 @@ def test_harmonics_are_those_of_the_published_splats() -> None:
     third += [e / 2 * z * (x * x - y * y), -d * x * (x * x - 3 * y * y)]
     expected = {1: [-a * y, a * z, -a * x], 2: second, 3: third}
     assert list(HARMONICS) == [1, 2, 3]
+    assert pytest.approx(0.28209479177387814, rel=1e-14) == C0
     for degree, harmonics in HARMONICS.items():
         np.testing.assert_allclose(harmonics(x, y, z), expected[degree], rtol=0, atol=1e-12)
