@@ -17,6 +17,7 @@ from made_splats import random_splats
 
 from blender_addon.core import cameras, colmap, files, ply, splats, units
 from blender_addon.core.errors import InputError
+from blender_addon.core.harmonics import C0, HARMONICS
 from blender_addon.core.statistics import Filter, bars, outliers, summary
 
 UNIT = np.eye(4).tolist()
@@ -286,3 +287,20 @@ def test_a_ply_is_the_same_whatever_the_size_of_its_blocks(
     (tmp_path / "cut.ply").write_bytes(data[:-1])
     with pytest.raises(InputError, match="claims 10 rows of `vertex`"):
         ply.read_ply(tmp_path / "cut.ply")
+
+
+def test_harmonics_are_those_of_the_published_splats() -> None:
+    """The basis of Kerbl et al. 2023 with the constants of their code, at directions on the unit sphere."""
+    directions = np.random.default_rng(4).normal(size=(20, 3))
+    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    a, b, c = 0.48860251190291987, 1.0925484305920792, 0.31539156525252005
+    d, e, f, g = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154
+    second = [b * x * y, -b * y * z, c * (2 * z * z - x * x - y * y), -b * x * z, b / 2 * (x * x - y * y)]
+    third = [-d * y * (3 * x * x - y * y), e * x * y * z, -f * y * (4 * z * z - x * x - y * y)]
+    third += [g * z * (2 * z * z - 3 * x * x - 3 * y * y), -f * x * (4 * z * z - x * x - y * y)]
+    third += [e / 2 * z * (x * x - y * y), -d * x * (x * x - 3 * y * y)]
+    expected = {1: [-a * y, a * z, -a * x], 2: second, 3: third}
+    assert list(HARMONICS) == [1, 2, 3]
+    assert pytest.approx(0.28209479177387814, rel=1e-14) == C0
+    for degree, harmonics in HARMONICS.items():
+        np.testing.assert_allclose(harmonics(x, y, z), expected[degree], rtol=0, atol=1e-12)

@@ -230,3 +230,46 @@ def test_values_of_a_prompt_may_be_their_bounds(name: str, fine: tuple[Any, ...]
     for value in refused:
         with pytest.raises(InputError):
             prompts.Prompt(**{"text": "a", name: value})
+
+
+def test_what_the_panel_begins_with_is_what_gsopt_does_by_itself(tmp_path: Path) -> None:
+    pytest.importorskip("tyro")
+    from gsopt.cli.train import read_flags
+    from gsopt.cli.train_flags import parse
+    from gsopt.sds.select_prior import DEFAULT_WEIGHT
+
+    training, guidance = arguments.Training(), arguments.Guidance()
+    words = arguments.train(Path("python"), tmp_path, tmp_path / "run", training, guidance)
+    asked, _ = read_flags(parse(words[4:]))
+    plain, _ = read_flags(parse([str(tmp_path), "-m", str(tmp_path / "run")]))
+    # A number of steps that somebody names is not stretched for few photos.
+    assert replace(asked, preview_every=plain.preview_every, sparse=plain.sparse) == plain
+    assert (training.downscale, training.max_gaussians, training.views, training.hold_out) == (1, 0, 0, False)
+    assert (guidance.weight, guidance.references, guidance.front_view) == (DEFAULT_WEIGHT, (), -1)
+
+
+def test_prompts_and_renderings_begin_with_what_their_programs_do_by_themselves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tyro = pytest.importorskip("tyro")
+    from gsopt.cli.prompts.generate import Flags
+
+    words = arguments.prompts(Path("python"), arguments.Writing("a chair"), tmp_path / "p.json")
+    plain = tyro.cli(Flags, args=["--notes=a chair", "-o", str(tmp_path / "p.json")])
+    assert tyro.cli(Flags, args=words[4:]) == plain
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "scripts"))
+    synth_views = pytest.importorskip("synth_views")
+    rendering = arguments.Rendering()
+    words = arguments.render("", "python", Path("s.py"), tmp_path / "a.glb", tmp_path / "out", rendering)
+    asked, alone = (synth_views.make_parser().parse_args(w) for w in (words[2:], [words[2], "-o", words[4]]))
+    for name in ("views", "layout", "samples", "lighting", "seed", "masks"):
+        assert getattr(asked, name) == getattr(alone, name)
+    assert (rendering.resolution, rendering.test_views, rendering.total) == (256, 10, 60)
+    assert words[words.index("--threads") + 1] == "0"
+
+
+def test_work_begins_with_seed_0_and_all_cores() -> None:
+    python, folder = Path("python"), Path("a")
+    assert arguments.resume(python, folder)[-2:] == ["--threads", "0"]
+    assert arguments.poses(python, folder, Path("b"))[-4:] == ["--seed", "0", "--threads", "0"]
+    assert arguments.resume(python, folder, 3)[-1] == "3"

@@ -276,3 +276,34 @@ def test_on_windows_a_process_lives_while_it_has_no_exit_code(monkeypatch: pytes
     assert [job._alive_on_windows(pid) for pid in (7, 8, 9)] == [True, False, False]
     assert [job._birth_on_windows(pid) for pid in (7, 8, 9)] == ["7 1007", "8 1008", ""]
     assert kernel.open == []
+
+
+@pytest.mark.parametrize(("more", "total"), [(0, 5), (1, 0)])
+def test_a_reader_skips_ahead_when_it_is_more_than_two_mebibytes_behind(tmp_path: Path, more: int, total: int) -> None:
+    began = line("started", pid=os.getpid(), total=5)
+    (tmp_path / "events.jsonl").write_bytes(began.ljust((2 << 20) + more, b"\n"))
+    assert Follower(tmp_path).poll().total == total
+
+
+def test_a_reader_that_skips_ahead_reads_the_last_quarter_of_a_mebibyte(tmp_path: Path) -> None:
+    early, late, piece = line("warning", 1, message="early"), line("warning", 2, message="late"), 1 << 18
+    before = early.rjust(3 << 20, b"\n")
+    (tmp_path / "events.jsonl").write_bytes(before + (b"\n" + late).ljust(piece, b"\n"))
+    follower = Follower(tmp_path)
+    assert [follower.poll().messages for _ in range(2)] == [["late"], ["late"]]
+
+
+def test_a_hundred_earlier_runs_are_told_where_nobody_asks_for_fewer(tmp_path: Path) -> None:
+    for i in range(101):
+        (tmp_path / str(i)).mkdir()
+        (tmp_path / str(i) / "config.json").touch()
+    assert len(earlier_runs(tmp_path)) == 100
+
+
+@pytest.mark.parametrize(("age", "status"), [(895, "running"), (905, "killed")])
+def test_a_run_of_an_unknown_process_goes_on_for_900_seconds_after_its_last_event(
+    tmp_path: Path, age: int, status: str
+) -> None:
+    (tmp_path / "events.jsonl").write_bytes(line("progress", step=1, total=5))
+    os.utime(tmp_path / "events.jsonl", (0, time.time() - age))
+    assert Follower(tmp_path).poll().status == status

@@ -78,3 +78,47 @@ def test_every_truncation_is_refused(tmp_path: Path) -> None:
 def load_splats_of(folder: Path, data: bytes) -> torch.Tensor:
     (folder / "whole.ksplat").write_bytes(data)
     return load_splats(folder / "whole.ksplat").means.sum()
+
+
+@pytest.mark.parametrize("level", range(3))
+def test_sections_follow_each_other_and_share_the_highest_degree(tmp_path: Path, level: int) -> None:
+    one, two = ksplat(level, 5, 1), ksplat(level, 3, 2)
+    header = bytearray(one[:4096])
+    struct.pack_into("<I", header, 4, 2)
+    (tmp_path / "a.ksplat").write_bytes(header + one[4096:5120] + two[4096:5120] + one[5120:] + two[5120:])
+    (tmp_path / "one.ksplat").write_bytes(one)
+    (tmp_path / "two.ksplat").write_bytes(two)
+    found, first, last = (load_splats(tmp_path / f"{name}.ksplat") for name in ("a", "one", "two"))
+    assert (len(found), found.sh_degree) == (8, 2)
+    assert torch.equal(found.means, torch.cat([first.means, last.means]))
+    assert torch.equal(found.shN[:5, :3], first.shN)
+    assert torch.equal(found.shN[5:], last.shN)
+    assert not found.shN[:5, 3:].any()
+
+
+@pytest.mark.parametrize(
+    ("offset", "kind", "value", "message"),
+    [
+        (1, "B", 0, "must begin as"),
+        (1, "B", 2, None),
+        (4, "I", 0, "holds no splats"),
+        (20, "H", 2, None),
+        (4096, "I", 6, "claims 6 of 5 splats"),
+        (4112, "f", -1.0, "Damaged"),
+        (4112, "f", math.nan, "Damaged"),
+        (4112, "f", 1e30, "Damaged"),
+        (4112, "f", 0.99e30, None),
+        (4112, "f", 0.0, None),
+    ],
+)
+def test_numbers_of_a_header_may_be_their_bounds(
+    tmp_path: Path, offset: int, kind: str, value: float, message: str | None
+) -> None:
+    data = bytearray(ksplat(2, 5, 3))
+    struct.pack_into(f"<{kind}", data, offset, value)
+    (tmp_path / "a.ksplat").write_bytes(bytes(data))
+    if message is None:
+        assert len(load_splats(tmp_path / "a.ksplat")) == 5
+    else:
+        with pytest.raises(InputError, match=message):
+            load_splats(tmp_path / "a.ksplat")

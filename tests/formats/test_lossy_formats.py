@@ -202,3 +202,24 @@ def test_plain_and_compressed_ply_are_told_apart_by_content(tmp_path: Path) -> N
     (tmp_path / "b.compressed.ply").rename(tmp_path / "d.ply")
     assert same_bits(load_splats(tmp_path / "c.compressed.ply"), make_splats(5))
     assert len(load_splats(tmp_path / "d.ply")) == 5
+
+
+@pytest.mark.parametrize("suffix", [".sog", ".compressed.ply"])
+def test_log_scales_are_held_to_20(tmp_path: Path, suffix: str) -> None:
+    splats = make_splats(count=2)
+    splats.log_scales[:] = torch.tensor([[-30.0] * 3, [30.0] * 3])
+    found = round_trip(tmp_path / f"a{suffix}", splats).log_scales
+    assert sorted(found.flatten().tolist()) == pytest.approx([-20.0] * 3 + [20.0] * 3, abs=0.02)
+    splats.log_scales[:] *= 19.9 / 30
+    found = round_trip(tmp_path / f"b{suffix}", splats).log_scales
+    assert float(found.abs().min()) == pytest.approx(19.9, abs=0.02)
+
+
+def test_coefficients_of_a_sog_are_held_to_100(tmp_path: Path) -> None:
+    splats = make_splats(count=2, degree=1)
+    signs = torch.tensor([-1.0, 1.0])[:, None, None]
+    for value, held in ((300.0, 100.0), (99.5, 99.5)):
+        splats.sh0[:], splats.shN[:] = value * signs, value * signs
+        found = round_trip(tmp_path / f"{value}.sog", splats)
+        for values in (found.sh0, found.shN):
+            assert sorted(values[:, 0, 0].tolist()) == pytest.approx([-held, held], abs=0.1)

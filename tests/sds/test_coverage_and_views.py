@@ -174,6 +174,49 @@ def test_no_more_views_are_looked_through_than_matter() -> None:
     assert coverage.spread(many[:5]) == many[:5]
 
 
+@pytest.mark.parametrize("cosine", [0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 1.0])
+@pytest.mark.parametrize(("middle", "longest"), [(0.1, 0.1), (0.02, 0.1)])
+def test_a_flat_shape_fades_from_half_face_on_to_a_tenth(cosine: float, middle: float, longest: float) -> None:
+    """Hermite's step between |cos| 0.1 and 0.5; only as much as the shape is flat: 1 - shortest / middle."""
+    disc = replace(wall(0.0), log_scales=torch.tensor([[0.01, middle, longest]]).log().repeat(289, 1))
+    disc = replace(disc, means=torch.zeros(289, 3))
+    for sign in (1, -1):
+        eye = 3 * torch.tensor([sign * cosine, math.sqrt(1 - cosine**2), 0.0])
+        x = min(1.0, max(0.0, (cosine - 0.1) / 0.4))
+        expected = 1 - (1 - 0.01 / middle) * (1 - (3 * x**2 - 2 * x**3))
+        assert coverage.facing(disc, eye)[0].item() == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize(("behind", "covered"), [(0.99, 1.0), (1.01, 0.0)])
+def test_a_center_may_lie_two_deviations_and_a_fiftieth_of_the_depth_behind_the_surface(
+    behind: float, covered: float
+) -> None:
+    frame = SimpleNamespace(depths=torch.full((8, 8), 5.0), alphas=torch.ones(8, 8))
+    backend: Any = SimpleNamespace(forward=lambda *_, **__: frame)
+    eye = Cameras(torch.eye(4)[None], intrinsics(0.8, 8, 8)[None].float(), 8, 8)
+    depth = 5.0 + behind * (2 * 0.2 + 0.02 * 5.0)
+    ball = replace(cloud(1, 0), means=torch.tensor([[0.0, 0.0, depth]]), log_scales=torch.full((1, 3), math.log(0.2)))
+    assert coverage.seen(ball, eye, backend).tolist() == pytest.approx([covered])
+
+
+def test_32_views_are_looked_through_and_their_order_stays() -> None:
+    many = [camera(3.6 * i) for i in range(33)]
+    found = coverage.spread(many)
+    assert len(found) == 32
+    assert coverage.spread(many[:32]) == many[:32]
+    rows = [next(row for row, one in enumerate(many) if one is view) for view in found]
+    assert rows == sorted(set(rows))
+
+
+@pytest.mark.parametrize(("alpha", "covered"), [(0.5, 1.0), (0.51, 0.0)])
+def test_a_pixel_hides_what_is_behind_it_above_half_opacity(alpha: float, covered: float) -> None:
+    frame = SimpleNamespace(depths=torch.full((8, 8), alpha), alphas=torch.full((8, 8), alpha))
+    backend: Any = SimpleNamespace(forward=lambda *_, **__: frame)
+    eye = Cameras(torch.eye(4)[None], intrinsics(0.8, 8, 8)[None].float(), 8, 8)
+    ball = replace(cloud(1, 0), means=torch.tensor([[0.0, 0.0, 9.0]]), log_scales=torch.full((1, 3), -5.0))
+    assert coverage.seen(ball, eye, backend).tolist() == pytest.approx([covered])
+
+
 INPUTS = [camera(0, 20), camera(40, 20), camera(80, 20), camera(-40, 20)]
 
 
@@ -205,6 +248,7 @@ def test_cameras_that_look_at_no_common_subject_are_interpolated() -> None:
     inputs = [Cameras(viewmats[i : i + 1], intrinsics(0.8, 64, 64)[None].float(), 64, 64) for i in range(3)]
     cameras = guidance_cameras(inputs, 1.0, 32, inputs[0])
     assert cameras.angles is None
+    assert len(cameras.candidates) == 24
     assert float(cameras.candidates.centers[:, 0].min()) >= -1e-4
     assert float(cameras.candidates.centers[:, 0].max()) <= 2 + 1e-4
     assert torch.equal(cameras.camera(3, generator(0, 0, 0, "jitter")).viewmats, cameras.candidates[3].viewmats)
