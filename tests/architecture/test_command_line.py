@@ -203,7 +203,7 @@ def test_a_full_pipe_that_does_not_block_is_waited_for() -> None:
             read.append(data)
 
     thread = threading.Thread(target=drain)
-    text, beneath = lasting(open(writer, "w"))  # noqa: SIM115
+    text, beneath = lasting(open(writer, "w", closefd=False))  # noqa: SIM115
     threading.Timer(0.2, thread.start).start()
     text.write("x" * 500_000)
     text.flush()
