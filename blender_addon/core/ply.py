@@ -102,13 +102,13 @@ def seek_vertex(file: BinaryIO, elements: list[Element], path: Path) -> Element:
         need, have = element.count * element.row.itemsize, size - file.tell()
         if need > have:
             raise InputError(
-                f"{path} claims {element.count:,} rows of `{element.name}`, {need:,} bytes, but has {max(have, 0):,}. "
+                f"{path} claims {element.count:,} rows of `{element.name:.40}`, {need:,} bytes, but has {max(have, 0):,}. "
                 "It was cut short or is damaged: copy or export it again."
             )
         if element.name == "vertex":
             return element
         file.seek(need, os.SEEK_CUR)
-    raise InputError(f"{path} has no element `vertex`, got {[e.name for e in elements]}. Choose a file of splats.")
+    raise InputError(f"{path} has no element `vertex`. Choose a file of splats.")
 
 
 def bands_of(vertex: Element, path: Path) -> int:

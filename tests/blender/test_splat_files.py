@@ -225,3 +225,11 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     for read in (read_ply, read_spz):
         with pytest.raises(InputError, match=r"gone"):
             read(tmp_path / "gone")
+
+
+def test_a_header_of_many_long_names_is_refused_in_a_short_message(tmp_path: Path) -> None:
+    elements = b"".join(b"element %s 0\n" % (letter * 900) for letter in (b"a", b"b", b"c"))
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n" + elements + b"end_header\n")
+    with pytest.raises(InputError, match="no element `vertex`") as refused:
+        read_ply(tmp_path / "a.ply")
+    assert len(str(refused.value)) < len(str(tmp_path)) + 100
