@@ -116,7 +116,7 @@ def _is_map(shape: tuple[int, ...]) -> bool:
 def _read_png(path: Path) -> Float[Tensor, "H W"]:
     try:
         with Image.open(path, formats=("PNG",)) as image:
-            if reason := bomb(image, path, 1):
+            if reason := bomb(image, path):
                 raise ValueError(f"it declares {reason}")
             if not image.mode.startswith("I"):
                 raise ValueError(f"its mode is {image.mode}; a gray image of 16 bits is read")
