@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -158,7 +159,8 @@ def scene_of_splats(
         gaussians.means[gaussians.opacities >= gaussians.opacities.median()] if len(gaussians) else torch.zeros(1, 3)
     )
     center = means.median(dim=0).values
-    radius = max(float((means - center).norm(dim=1).quantile(0.9)), 1e-6) if len(means) < 1 << 24 else 1.0
+    distances = (means - center).norm(dim=1)
+    radius = max(float(distances.kthvalue(math.ceil(0.9 * len(distances))).values), 1e-6)
     viewmat = torch.eye(4)
     viewmat[:3, 3] = torch.tensor([0, 0, 2.6 * radius]) - center
     f = 1.1 * DEFAULT_SIZE
