@@ -155,3 +155,13 @@ def test_a_job_outlives_a_killed_blender_and_is_found_again(tmp_path: Path) -> N
     while job.alive(found):
         assert time.monotonic() < until
         time.sleep(0.02)
+
+
+def test_a_program_whose_record_cannot_be_written_does_not_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = set(job._children)
+    with pytest.raises(InputError, match="No JSON file can hold"):
+        job.start("train", [sys.executable, "-c", "import time; time.sleep(60)", "\udcff"], tmp_path)
+    (pid,) = set(job._children) - known
+    assert job._children[pid].wait(10) != 0

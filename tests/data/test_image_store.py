@@ -187,3 +187,16 @@ def test_floating_point_images_are_refused(tmp_path: Path) -> None:
     Image.fromarray(np.eye(4, dtype=np.float32)).save(tmp_path / "f.tiff")
     with pytest.raises(InputError, match="floating-point"):
         read_pixels(tmp_path / "f.tiff")
+
+
+def test_an_image_too_large_for_the_cache_drives_no_other_out(tmp_path: Path) -> None:
+    sides = (256, 640)
+    for side in sides:
+        save_image(tmp_path / f"{side}.png", np.full((side, side, 4), 9, dtype=np.uint8))
+    paths = [tmp_path / f"{side}.png" for side in sides]
+    sources = [ImageSource(path, None, (side, side), None, side, side) for path, side in zip(paths, sides, strict=True)]
+    store = ImageStore(sources, cache_mb=1)
+    first = store.get(0)
+    store.get(1)
+    assert store.get(0) is first
+    assert store.cached_bytes == 4 * 256**2

@@ -7,19 +7,21 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from finished_runs import make_run, splats
 
 from gsopt.cli import main
 from gsopt.data.scene import load_scene
+from gsopt.data.sfm.placement import Similarity
 from gsopt.errors import InputError
 from gsopt.formats import load_splats, save_splats
 from gsopt.formats.placement import placed
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.quats import rotation_matrices
 from gsopt.results.finished_run import open_run
-from gsopt.results.merge import better, error_sums, merge, with_degree
+from gsopt.results.merge import better, error_sums, merge, turned_degrees, with_degree
 
 SCALE, TURN = 1.7, rotation_matrices(torch.tensor([0.8, 0.3, 0.5, -0.2], dtype=torch.float64))
 SHIFT = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
@@ -147,3 +149,11 @@ def test_the_merged_file_keeps_unit_and_format(tmp_path: Path) -> None:
 
     assert read_units(tmp_path / "both.sog").meters_per_unit == 0.5
     save_splats(tmp_path / "c.ply", load_splats(tmp_path / "both.sog"))
+
+
+@pytest.mark.parametrize(("signs", "degrees"), [((1, 1, 1), 0.0), ((1, -1, -1), 180.0)])
+def test_a_turn_that_rounding_made_larger_than_possible_is_still_an_angle(
+    signs: tuple[int, ...], degrees: float
+) -> None:
+    rotation = np.diag(signs) * (1 + 1e-12)
+    assert turned_degrees(Similarity(1.0, rotation, np.zeros(3))) == degrees

@@ -150,3 +150,12 @@ def test_nothing_is_near_where_there_is_no_reference_and_depths_come_along() -> 
     assert found.depths.unique().tolist() == [1.0]
     empty = Cameras(cameras.viewmats[:0], cameras.Ks[:0], 8, 8)
     assert nearest(References(torch.zeros(0, 3, 8, 8), torch.ones(0, 1, 8, 8), empty), camera(80), 1) is None
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 24), (24, 48)])
+def test_the_picture_shows_the_middle_square_that_its_camera_sees(height: int, width: int) -> None:
+    """Of 48 px the 12 at either end are cut: a picture that is white in the middle alone becomes white."""
+    pixels = torch.zeros(height, width, 3, dtype=torch.uint8)
+    pixels[(height - 24) // 2 : (height + 24) // 2, (width - 24) // 2 : (width + 24) // 2] = 255
+    view: Any = SimpleNamespace(pixels=lambda: pixels, camera=camera(0, 0, width=width, height=height))
+    assert float(square_views([view], 24, torch.zeros(3)).images.min()) == 1

@@ -293,3 +293,11 @@ def test_what_is_left_open_is_resolved_by_the_kind_of_prior_and_what_is_given_st
     names = ("policy", "every", "guidance_scale", "denoise_steps", "min_uncertainty", "certain_weight")
     for kind in (True, False):
         assert [getattr(resolved(given, kind), name) for name in names] == [getattr(given, name) for name in names]
+
+
+def test_inversion_asks_for_nothing_but_the_unconditional_noise() -> None:
+    prior = PixelPrior(gaussian_posterior(0.3, 0.5))
+    words = Pair(Condition(), Condition())
+    policies.inverted(prior, normal(1, 3, 4, 4), look(pair=words, scale=scale(7.5)), 3)
+    assert len(prior.seen) == 3
+    assert all(condition is words.negative for condition in prior.seen)

@@ -32,6 +32,7 @@ def painted(seen_from: Cameras) -> torch.Tensor:
 
 def test_lifting_is_the_inverse_of_projection() -> None:
     here = camera(0.7)
+    here.viewmats[0, :3, 3] += torch.tensor([0.3, -0.2, 0.1])  # no axis looks through the origin
     depth = 2 + torch.rand(SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     column, row, z = project(here, lift(here, depth).view(-1, 3))
     i, j = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")

@@ -237,3 +237,11 @@ def test_the_ratio_is_that_of_squared_correlations_to_chance_over_gaussians_seen
             expected += float(Y.square().sum() * g.var(0).sum())
         assert bands.ratio() == pytest.approx(found / expected, rel=1e-3)
         assert bands.tensors()["n"].tolist() == [2, 3, 1, 0]
+
+
+def test_the_target_cache_holds_the_megabytes_that_the_plan_grants(dataset: Path) -> None:
+    config = tiny_config(dataset)
+    scene = load_scene(config.data)
+    gaussians, _ = first_gaussians(scene, config.init, 3, 0)
+    plan = replace(RunPlan.of(config, scene), target_cache_mb=1.5)
+    assert Trainer(plan, scene, gaussians, make_backend("cpu", 1))._targets._budget == 1_500_000

@@ -91,3 +91,14 @@ def test_poses_are_refuted_by_misses_of_four_px_where_no_few_photos_are_to_blame
     assert made is (given if kept else None)
     assert len(advice) == 1
     assert "they miss each other by 7 px" in advice[0]
+
+
+@pytest.mark.parametrize(("shared", "loose"), [(4, True), (5, False)])
+def test_a_photo_that_shares_four_of_the_usual_seventeen_points_is_loosely_held(shared: int, loose: bool) -> None:
+    tracks = [(1, 2)] * 17 + [(1, 3)] * shared
+    points = {
+        i: SimpleNamespace(track=SimpleNamespace(elements=[SimpleNamespace(image_id=number) for number in track]))
+        for i, track in enumerate(tracks)
+    }
+    found = SimpleNamespace(points3D=points, reg_image_ids=lambda: [1, 2, 3])
+    assert held.loosely_held(found, {3}) == loose

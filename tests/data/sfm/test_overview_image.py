@@ -128,3 +128,14 @@ def test_six_names_at_most_and_one_camera_alone_are_drawn() -> None:
     named = [bool(ink[350:372, round(x) + 6 : round(x) + 16].any()) for x in columns]
     assert named == [True, False] * 5 + [True]
     assert draw_scene(viewmats[:1], ["x"], *empty, "")
+
+
+def test_what_is_near_lies_near_the_cameras_wherever_these_are() -> None:
+    """Cameras and points moved alike, far from the origin, are shown alike."""
+    generator = np.random.default_rng(0)
+    centers, points = generator.normal(size=(4, 3)), generator.normal(size=(50, 3))
+    middle, half = overview_image._window(centers, points)
+    away = np.array([300.0, -200.0, 100.0])
+    moved_middle, moved_half = overview_image._window(centers + away, points + away)
+    assert moved_middle - away == pytest.approx(middle)
+    assert moved_half == pytest.approx(half)

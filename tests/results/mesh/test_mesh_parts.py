@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from gsopt.errors import InputError
 from gsopt.formats.mesh_files import Mesh
 from gsopt.geometry.cameras import Cameras
 from gsopt.init.thumbnails import Thumbnail
-from gsopt.results.mesh import surface
+from gsopt.results.mesh import extract, surface
 from gsopt.results.mesh.extract import _given, around
 from gsopt.results.mesh.fusion import Box, box_around, fused, signed_distance, truncation
 from gsopt.results.mesh.hull_distance import hull_distance, outlines
@@ -182,3 +184,19 @@ def test_a_box_that_is_none_is_refused(box: tuple[float, ...]) -> None:
         _given(box)
     low, high = _given((0, 1, 2, 3, 4, 5))
     assert (low.tolist(), high.tolist()) == ([0, 1, 2], [3, 4, 5])
+
+
+def test_two_opaque_splats_where_the_cameras_look_make_a_box_and_one_does_not() -> None:
+    """Between the 1st and the 99th hundredth of what lies within 4 units, whatever the third, transparent one says."""
+    means = torch.tensor([[0.0, 0, 0], [1, 2, 3], [0, 3, 0], [9, 9, 9]])
+    scene: Any = SimpleNamespace(has_alpha=False)
+    focus: Any = SimpleNamespace(point=torch.zeros(3), radius=4.0)
+
+    def run(opacities: list[float]) -> Any:
+        return SimpleNamespace(gaussians=SimpleNamespace(means=means, opacities=torch.tensor(opacities)), path="run")
+
+    low, high = extract._corners(run([0.9, 0.9, 0.1, 0.9]), scene, [], focus)
+    torch.testing.assert_close(low + high, means[1])
+    assert (high - low > 0.9 * means[1]).all()
+    with pytest.raises(InputError, match="no opaque splats"):
+        extract._corners(run([0.9, 0.1, 0.1, 0.9]), scene, [], focus)
