@@ -201,6 +201,25 @@ def case_speed(bench: Bench, side: int, count: int, most: dict[str, float]) -> d
     return row
 
 
+def profile(bench: Bench) -> dict[str, Any]:
+    """Time that every kernel of an iteration takes on the GPU, torch's own among them, in microseconds."""
+    sizes = ((32, 300),) if bench.tiny else (CASES[1], CASES[3])
+    return {f"{side} px, {count}": case_profile(bench, side, count) for side, count in sizes}
+
+
+def case_profile(bench: Bench, side: int, count: int) -> dict[str, float]:
+    iteration, repetitions = Iteration(bench, side, count), 2 if bench.tiny else 20
+    for _ in range(repetitions):
+        iteration.run()
+    bench.wait()
+    with torch.profiler.profile() as profiler:
+        for _ in range(repetitions):
+            iteration.run()
+        bench.wait()
+    rows = {row.key[:100]: row.self_device_time_total / repetitions for row in profiler.key_averages()}
+    return {key: round(us, 2) for key, us in sorted(rows.items(), key=lambda row: -row[1]) if us > 0}
+
+
 def least_seconds(count: int, entries: int, pixels: int, most: dict[str, float]) -> float:
     """Bytes that must move once, or operations on every pixel of a listed tile, whichever takes longer."""
     gaussians = 4 * (2 * FLOATS + 6 * FLOATS + 3 * 14)  # read twice, stepped with two moments, gradients without bands
@@ -279,6 +298,7 @@ PARTS = {
     "stress": stress,
     "repeatability": repeatability,
     "speed": speed,
+    "profile": profile,
     "lego": lego,
     "stable_diffusion": stable_diffusion,
 }
