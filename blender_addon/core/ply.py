@@ -102,8 +102,8 @@ def seek_vertex(file: BinaryIO, elements: list[Element], path: Path) -> Element:
         need, have = element.count * element.row.itemsize, size - file.tell()
         if need > have:
             raise InputError(
-                f"{path} claims {element.count:,} rows of `{element.name:.40}`, {need:,} bytes, but has {max(have, 0):,}. "
-                "It was cut short or is damaged: copy or export it again."
+                f"{path} claims {element.count:,} rows of `{element.name:.40}`, {need:,} bytes, "
+                f"but has {max(have, 0):,}. It was cut short or is damaged: copy or export it again."
             )
         if element.name == "vertex":
             return element
