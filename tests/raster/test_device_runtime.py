@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +22,7 @@ from simt_runtime import SimtRuntime, simt_backend
 from gsopt.errors import MissingDependency, NumericalError, SettingError, UsageError
 from gsopt.raster.api import make_backend, rasterize
 from gsopt.raster.device import cache, gpu
-from gsopt.raster.device.backend import DeviceBackend
+from gsopt.raster.device.backend import MOST_TENSORS, NO_TENSOR, DeviceBackend
 from gsopt.raster.device.driver import HIP_DRIVER, Driver, open_driver
 from gsopt.raster.device.gpu import GpuRuntime, Tools
 from gsopt.raster.device.layout import kernels
@@ -34,6 +36,8 @@ class FakeLibrary:
         self.load_status, self.launch_status = load_status, launch_status
         self.launched: list[str] = []
         self._names: list[str] = []
+        self._thread = threading.local()
+        self._thread.context = 5  # as torch leaves it in the thread that asks for the GPU
 
     def cuDriverGetVersion(self, number: Any) -> int:
         number._obj.value = 12040
@@ -42,6 +46,14 @@ class FakeLibrary:
     def cuGetErrorString(self, status: int, text: Any) -> int:
         known = {2: b"out of memory", 222: b"the provided PTX was compiled with an unsupported toolchain."}
         text._obj.value = known.get(status, b"an illegal memory access was encountered")
+        return 0
+
+    def cuCtxGetCurrent(self, context: Any) -> int:
+        context._obj.value = getattr(self._thread, "context", None)
+        return 0
+
+    def cuCtxSetCurrent(self, context: Any) -> int:
+        self._thread.context = context.value
         return 0
 
     def cuModuleLoadData(self, module: Any, code: bytes) -> int:
@@ -54,6 +66,8 @@ class FakeLibrary:
         return 0
 
     def cuLaunchKernel(self, function: Any, *rest: Any) -> int:
+        if getattr(self._thread, "context", None) != 5:
+            return 201
         name = self._names[function.value - 1]
         blocks, threads, values = rest[0].value, rest[3].value, rest[8]
         assert threads == 256
@@ -124,6 +138,16 @@ def test_a_kernel_gets_its_record_through_the_driver(machine: FakeLibrary) -> No
     assert backend.runtime.about["device"] == "Pretended GPU (cuda:0)"
     assert backend.runtime.about["arch"] == "sm_90"
     assert "driver for CUDA 12.4" in backend.runtime.about["library"]
+
+
+def test_a_thread_without_a_context_gets_the_one_of_torch(machine: FakeLibrary) -> None:
+    """As that in which autograd calls `backward`."""
+    with pretend_gpu():
+        runtime = GpuRuntime(GPU, tools(machine))
+    nothing = {"rates": {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}, "tensors": 0, "of": [NO_TENSOR] * MOST_TENSORS}
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(runtime.launch, "adam", 1, nothing).result()
+    assert machine.launched == ["adam"]
 
 
 def test_kernels_are_compiled_once(machine: FakeLibrary, tmp_path: Path) -> None:

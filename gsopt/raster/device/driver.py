@@ -21,15 +21,18 @@ class DriverDialect:
     """Names of the library, on Linux and on Windows."""
     prefix: str
     launch: str
+    has_contexts: bool
+    """True where a thread must have a context of its own choice to start a kernel."""
 
 
 CUDA_DRIVER = DriverDialect(
-    ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so.1", "libcuda.so"), "cu", "cuLaunchKernel"
+    ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so.1", "libcuda.so"), "cu", "cuLaunchKernel", True
 )
 HIP_DRIVER = DriverDialect(
     ("amdhip64.dll",) if sys.platform == "win32" else ("libamdhip64.so", "libamdhip64.so.6"),
     "hip",
     "hipModuleLaunchKernel",
+    False,
 )
 
 
@@ -64,8 +67,24 @@ class Driver:
             self._check(self._call("ModuleGetFunction", ctypes.byref(function), module, name.encode()))
         return functions
 
-    def launch(self, function: ctypes.c_void_p, blocks: int, stream: int, arguments: ctypes.Structure) -> None:
-        """Start a kernel that takes one record."""
+    def context(self) -> ctypes.c_void_p:
+        """This thread's context, which torch made; null where the driver has none."""
+        found = ctypes.c_void_p()
+        if self._dialect.has_contexts:
+            self._check(self._call("CtxGetCurrent", ctypes.byref(found)))
+        return found
+
+    def launch(
+        self,
+        function: ctypes.c_void_p,
+        blocks: int,
+        stream: int,
+        arguments: ctypes.Structure,
+        context: ctypes.c_void_p,
+    ) -> None:
+        """Start a kernel that takes one record; in `context` where the thread has none, as autograd's does not."""
+        if context and not self.context():
+            self._check(self._call("CtxSetCurrent", context))
         values = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         grid = (ctypes.c_uint(blocks), ctypes.c_uint(1), ctypes.c_uint(1))
         block = (ctypes.c_uint(THREADS), ctypes.c_uint(1), ctypes.c_uint(1))

@@ -54,6 +54,7 @@ class GpuRuntime:
         with torch.cuda.device(device):
             torch.empty(1, device=device)  # torch makes its context, and makes it current
             self._functions = tools.driver.load(code, list(self._records))
+            self._context = tools.driver.context()
         self.about = {
             "device": f"{torch.cuda.get_device_name(device)} ({device})",
             "arch": arch,
@@ -65,7 +66,8 @@ class GpuRuntime:
         """See `Runtime.launch`."""
         with torch.cuda.device(self.device):
             stream = torch.cuda.current_stream(self.device).cuda_stream
-            self._driver.launch(self._functions[kernel], blocks, stream, filled(self._records[kernel], arguments))
+            record = filled(self._records[kernel], arguments)
+            self._driver.launch(self._functions[kernel], blocks, stream, record, self._context)
 
 
 def processor(device: torch.device) -> str:
