@@ -24,7 +24,8 @@ MARK_SHARE = 0.7
 @torch.no_grad()
 def unseen(gaussians: Gaussians, cameras: Sequence[Cameras]) -> Bool[Tensor, "N"]:
     """True for every Gaussian that no input camera sees."""
-    return coverage(gaussians, cameras, make_backend("auto", 1)) < MIN_COVERAGE
+    backend = make_backend("auto", 1)
+    return coverage(gaussians.to(backend.device), cameras, backend) < MIN_COVERAGE
 
 
 def marked(rgb: Float[Tensor, "N 3"], hidden: Bool[Tensor, "N"]) -> Float[Tensor, "N 3"]:

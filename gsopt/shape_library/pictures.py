@@ -29,9 +29,9 @@ def picture(shape: Shape, backend: Backend) -> UInt8[Tensor, "S S 3"]:
     place = (cells + 0.5) / SIDE
     color = torch.from_numpy(shape.colors.copy())[tuple((place * COLOR_SIDE).long().T)]
     points = (place - 0.5) * torch.from_numpy(shape.sizes.copy())
-    gaussians = voxel_gaussians(points, color.float() / 255, SPLAT_SCALE / SIDE)
+    gaussians = voxel_gaussians(points, color.float() / 255, SPLAT_SCALE / SIDE).to(backend.device)
     colors = backend.forward(gaussians, _camera(), RasterSettings(sh_degree=0), torch.ones(3)).colors
-    return (colors.clamp(0, 1) * 255).round().to(torch.uint8)
+    return (colors.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
 def _camera() -> Cameras:

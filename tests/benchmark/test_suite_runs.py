@@ -17,16 +17,20 @@ import torch
 from finished_runs import FOV, HEIGHT, WHITE, WIDTH, ring, splats
 from in_process_farm import InProcess
 from PIL import Image
+from pretend_gpu import pretend_gpu
+from simt_runtime import SimtRuntime, simt_backend
 from suite_records import MACHINE, record
 
 from gsopt import cli
 from gsopt.benchmark.suite import definition, estimate, result_file, run_figures, run_key, runner, single_run
 from gsopt.benchmark.suite.single_run import RunFailed, SuiteContext
+from gsopt.config.train import TrainConfig
 from gsopt.data.scene import load_scene
 from gsopt.geometry import quats
-from gsopt.raster.backend import RasterSettings
+from gsopt.raster.backend import Backend, RasterSettings
+from gsopt.raster.device.backend import DeviceBackend
 from gsopt.raster.reference import ReferenceBackend
-from gsopt.results.finished_run import draw
+from gsopt.results.finished_run import FinishedRun, draw
 from gsopt.sds.prompts import Prompt, PromptSet, write_set
 
 CASES = [
@@ -199,6 +203,27 @@ def test_overlap_of_silhouettes() -> None:
     assert run_figures.overlap(a, b) == 1
     a[:2], b[1:3] = True, True
     assert run_figures.overlap(a, b) == pytest.approx(4 / 12, abs=1e-6)
+
+
+def test_silhouettes_and_depths_of_a_gpu_are_compared_here(tmp_path: Path) -> None:
+    pixels = torch.full((HEIGHT, WIDTH, 4), 255, dtype=torch.uint8)
+    view: Any = SimpleNamespace(name="v.png", camera=ring(1), pixels=lambda: pixels)
+    (tmp_path / "depth").mkdir()
+    np.save(tmp_path / "depth" / "v.npy", np.full((HEIGHT, WIDTH), 4.0))
+    scene: Any = SimpleNamespace(test=[view], path=tmp_path)
+
+    def shape(backend: Backend) -> dict[str, list[float | None]]:
+        settings = RasterSettings(sh_degree=0)
+        finished = FinishedRun(tmp_path, TrainConfig(), splats(), backend, settings, torch.zeros(3))
+        return run_figures.shape(finished, scene)
+
+    expected = shape(simt_backend())
+    with pretend_gpu():
+        assert shape(DeviceBackend(SimtRuntime(device="cuda:0"))) == expected
+    (iou,), (error,) = expected["mask_iou"], expected["depth_error"]
+    assert iou is not None
+    assert 0 < iou < 1
+    assert error is not None
 
 
 def test_depth_is_read_where_it_fits_and_is_a_plain_array(tmp_path: Path) -> None:

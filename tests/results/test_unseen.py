@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
+from pretend_gpu import pretend_gpu
+from simt_runtime import SimtRuntime
 
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
+from gsopt.raster.device.backend import DeviceBackend
 from gsopt.results.unseen import MARK, marked, unseen
 
 
@@ -32,6 +36,14 @@ def test_what_another_hides_or_the_frame_leaves_out_is_unseen() -> None:
     assert unseen(model, [camera(4.0)]).tolist() == [False, True, True]
     assert unseen(model, [camera(-4.0)]).tolist() == [True, False, True]
     assert unseen(model, [camera(4.0), camera(-4.0)]).tolist() == [False, False, True]
+
+
+def test_the_same_are_found_where_torch_sees_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    front, back, beside = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 9.0, 0.0)
+    with pretend_gpu():
+        gpu = DeviceBackend(SimtRuntime(device="cuda:0"))
+        monkeypatch.setattr("gsopt.results.unseen.make_backend", lambda *_: gpu)
+        assert unseen(balls([front, back, beside]), [camera(4.0)]).tolist() == [False, True, True]
 
 
 def test_only_hidden_colors_are_mixed_with_the_mark() -> None:

@@ -9,11 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from pretend_gpu import pretend_gpu
 from safetensors.numpy import load_file, save_file
+from simt_runtime import SimtRuntime, simt_backend
 
 from gsopt.errors import InputError
+from gsopt.raster.device.backend import DeviceBackend
 from gsopt.shape_library.entry import COLOR_SIDE, SIDE, Entry, Shape
 from gsopt.shape_library.library_file import FORMAT, SHAPE_BYTES, ShapeLibrary, packed, write_library
+from gsopt.shape_library.pictures import picture
 
 
 def random_shape(seed: int) -> Shape:
@@ -33,6 +38,15 @@ def test_shapes_and_texts_survive(tmp_path: Path) -> None:
         assert (back.occupied == shape.occupied).all()
         assert (back.colors == shape.colors).all()
         assert (back.sizes == shape.sizes).all()
+
+
+def test_a_picture_drawn_on_a_gpu_comes_back() -> None:
+    shape = random_shape(0)
+    expected = picture(shape, simt_backend())
+    with pretend_gpu():
+        drawn = picture(shape, DeviceBackend(SimtRuntime(device="cuda:0")))
+        assert torch.equal(drawn, expected)
+    assert 10 < float(drawn.float().mean()) < 250
 
 
 def test_every_cut_of_a_file_is_an_error_and_no_crash(library_copy: Path) -> None:

@@ -52,14 +52,15 @@ def _shape_of(finished: FinishedRun, scene: Scene, view: View) -> tuple[float | 
     frame = finished.backend.forward(
         finished.gaussians.to(finished.backend.device), camera, finished.settings, None, depth=True
     )
-    solid = frame.alphas > MASK_ALPHA
+    alphas = frame.alphas.cpu()
+    solid = alphas > MASK_ALPHA
     iou = overlap(solid, pixels[..., 3] > 255 * MASK_ALPHA) if pixels.shape[2] == 4 else None
     if depth is None or frame.depths is None:
         return iou, None
     both = solid & (depth > 0)
     if not bool(both.any()):
         return iou, None
-    error = (frame.depths[both] / frame.alphas[both] - depth[both]).abs().double().mean()
+    error = (frame.depths.cpu()[both] / alphas[both] - depth[both]).abs().double().mean()
     return iou, round(float(error), METRIC_DIGITS)
 
 
