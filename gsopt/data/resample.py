@@ -60,13 +60,13 @@ def _area_along(planes: Tensor, axis: int, size: int) -> Tensor:
     starts = torch.arange(size, dtype=torch.float64) * source / size
     ends = torch.arange(1, size + 1, dtype=torch.float64) * source / size
     first = starts.floor().long()
-    total = torch.zeros(*planes.shape[:axis], size, *planes.shape[axis + 1 :])
+    total = planes.new_zeros(*planes.shape[:axis], size, *planes.shape[axis + 1 :])
     for offset in range(math.ceil(step) + 1):
         # The share of source pixel `first + offset` that lies inside the target pixel.
         index = first + offset
         overlap = (torch.minimum(ends, index + 1.0) - torch.maximum(starts, index.double())).clamp(min=0)
         weight = (overlap / step).float().view(*[-1 if a == axis else 1 for a in range(3)])
-        total += planes.index_select(axis, index.clamp(max=source - 1)) * weight
+        total += planes.index_select(axis, index.clamp(max=source - 1).to(planes.device)) * weight.to(planes.device)
     return total
 
 

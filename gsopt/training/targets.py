@@ -91,9 +91,9 @@ class Targets:
     def _make(self, index: int, whole: bool) -> Target:
         view = self._views[index]
         height, width = (downscaled_size(extent, self._factor) for extent in (view.camera.height, view.camera.width))
-        colors, alphas = premultiplied(view.pixels(), width, height)
+        colors, alphas = premultiplied(view.pixels().to(self._device), width, height)
         if self._fixed is not None and alphas is not None:
-            colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed)
+            colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed.to(self._device))
         camera = view.camera.to(torch.float32).resized(width, height)
         depths = view.inverse_depths(height, width)
         target = Target(camera, colors, alphas, (height, width), view.color, depths)
