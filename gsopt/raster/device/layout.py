@@ -17,6 +17,7 @@ SCALARS: dict[str, Any] = {
     "bool": ctypes.c_bool,
     "Index": ctypes.c_int64,
 }
+NUMBERS = frozenset(SCALARS.values())
 STRUCT = re.compile(r"\bstruct (\w+) \{\n(.*?)\n\};", re.DOTALL)
 DECLARATION = re.compile(r"((?:GLOBAL )?(?:const )?)(\w+)(\W[^;]*);")
 DECLARATOR = re.compile(r"(\*?)\s*(\w+)(?:\[(\d+)\])?")
@@ -58,6 +59,7 @@ def kernels(text: str) -> dict[str, Layout]:
     return {match[1]: _structure(match[2], bodies, made) for match in KERNEL.finditer(text)}
 
 
+@functools.cache
 def members(layout: Layout) -> dict[str, Any]:
     """Names and types of its fields."""
     return {field[0]: field[1] for field in layout._fields_}
@@ -80,6 +82,8 @@ def filled(layout: Layout, values: Mapping[str, Any], pointer: Pointer = address
 
 
 def _filled_field(kind: Any, value: Any, pointer: Pointer) -> Any:
+    if kind in NUMBERS:  # first: most fields are, and a step fills ten records
+        return value
     if kind is ctypes.c_void_p:
         return pointer(value)
     if isinstance(value, Mapping):
