@@ -216,8 +216,8 @@ def case_profile(bench: Bench, side: int, count: int) -> dict[str, float]:
         for _ in range(repetitions):
             iteration.run()
         bench.wait()
-    rows = {row.key[:100]: row.self_device_time_total / repetitions for row in profiler.key_averages()}
-    return {key: round(us, 2) for key, us in sorted(rows.items(), key=lambda row: -row[1]) if us > 0}
+    spent = {found.key[:100]: found.self_device_time_total / repetitions for found in profiler.key_averages()}
+    return {key: round(us, 2) for key, us in sorted(spent.items(), key=lambda item: -item[1]) if us > 0}
 
 
 def least_seconds(count: int, entries: int, pixels: int, most: dict[str, float]) -> float:
@@ -242,6 +242,8 @@ def lego_run(bench: Bench, data: Path, steps: int) -> dict[str, Any]:
     bench.forget_peak()
     with tempfile.TemporaryDirectory() as folder:
         result = train(config, Path(folder, "run"))
+    if result.stopped:
+        raise RuntimeError(f"stopped after {result.steps} of {steps} steps")
     peak = bench.peak()
     scene = load_scene(config.data)
     views, white = scene.test[:2] if bench.tiny else scene.test, torch.ones(3)
