@@ -10,6 +10,8 @@ import pytest
 import torch
 from raster_scenes import Case, make_case, weights_like
 from simt_runtime import SIMT, SimtRuntime, simt_backend
+from stress_measure import Truth, deviation
+from tolerances import GRADIENT, IMAGE
 from torch import Tensor
 
 from gsopt.errors import NumericalError, UsageError
@@ -18,6 +20,7 @@ from gsopt.raster.backend import AdamStep, Backend, Gradients, RasterSettings
 from gsopt.raster.device import backend as device_backend
 from gsopt.raster.device import camera, frame, runtime
 from gsopt.raster.device.layout import kernels
+from gsopt.raster.device.runtime import THREADS
 from gsopt.raster.device.source import program
 
 
@@ -53,6 +56,19 @@ def test_no_order_of_threads_and_blocks_changes_a_bit(settings: RasterSettings) 
         assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True)), (lockstep, backwards)
 
 
+def test_segments_of_a_long_list_add_up_to_the_gradient_of_the_reference() -> None:
+    case = make_case(3, count=3000, width=24, height=17)
+    faint = replace(case.gaussians, logit_opacities=case.gaussians.logit_opacities * 0.2 - 3)
+    case = replace(case, gaussians=faint)
+    found = deviation(simt_backend(), Truth.of(case))
+    assert found.image <= IMAGE
+    assert found.gradient <= GRADIENT
+    context = simt_backend().forward(single(case).gaussians, case.camera, case.settings).context
+    drawn = torch.bincount(context.segments.tile_of[context.segments.tile_of >= 0])
+    assert drawn.tolist() == [-(-int(length) // THREADS) for length in context.entries.tile_begin.diff()]
+    assert int(drawn.max()) > 3
+
+
 def test_the_order_of_threads_is_really_another() -> None:
     orders = {tuple(SimtRuntime(*how)._order.threads) for how in ((32, False), (64, False), (32, True), (64, True))}
     assert len(orders) == 4
@@ -74,6 +90,7 @@ def test_numbers_that_python_and_kernels_share_are_the_same() -> None:
 
     assert told("kThreads") == runtime.THREADS
     assert told("kTile") == frame.TILE
+    assert told("kEndFields") == frame.END_FIELDS
     assert told("kBandGroup") == device_backend.BAND_GROUP
     assert f"AdamTensor of[{device_backend.MOST_TENSORS}];" in text
     assert told("kViewMargin") == pytest.approx(camera.VIEW_MARGIN)

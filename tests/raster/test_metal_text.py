@@ -62,7 +62,7 @@ def test_every_pointer_keeps_to_its_memory() -> None:
 @pytest.mark.parametrize(
     ("right", "wrong"),
     [
-        ("SHARED Row rows[kThreads];", "Row rows[kThreads];"),
+        ("SHARED Row rows[kSegment];", "Row rows[kSegment];"),
         ("IN_BLOCK const Row& row = rows[j];", "thread const Row& row = rows[j];"),
         ("GLOBAL const float* shN = P.shN", "thread const float* shN = P.shN"),
         ("float param = of.param[i]", "float param = 0.0 * of.param[i]"),

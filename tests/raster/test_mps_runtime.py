@@ -119,9 +119,7 @@ def test_a_gpu_of_too_few_threads_is_told(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_a_gpu_that_computes_wrong_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another trainer met gradients on Apple's GPUs that are zero, without an error."""
-    monkeypatch.setattr(
-        mps, "metal_program", lambda: metal_program().replace("sum += scratch.sums", "sum += 0.f * scratch.sums")
-    )
+    monkeypatch.setattr(mps, "metal_program", lambda: metal_program().replace("sum += in.sums", "sum += 0.f * in.sums"))
     with (
         fake_mps(),
         pytest.raises(NumericalError, match=r"mps:0 computes a test image wrong \(v_means by 1, .*--backend cpu"),

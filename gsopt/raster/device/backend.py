@@ -16,7 +16,7 @@ from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.precision import widest
 from gsopt.raster.backend import AdamStep, Gradients, Photometric, RasterSettings, RenderedFrame, enough_memory
 from gsopt.raster.device.camera import Views
-from gsopt.raster.device.frame import SUM_FIELDS, TILE, Context, Entries, Splats
+from gsopt.raster.device.frame import SUM_FIELDS, TILE, Context, Entries, Segments, Splats
 from gsopt.raster.device.layout import kernels, members
 from gsopt.raster.device.runtime import THREADS, Runtime
 from gsopt.raster.device.source import program
@@ -63,9 +63,8 @@ class DeviceBackend:
             self._launch("project_gaussians", len(gaussians), camera=view, P=P, **grid, **vars(splats))
             entries = Entries.of(splats, tiles_x, tiles_x * tiles_y, self._launch)
             image = self._blend(splats, entries, (height, width), behind, depth)
-        context = Context(
-            gaussians, view, P, behind, (height, width), splats, entries, image["transmittance"], image["last"]
-        )
+        segments = Segments(image["ends"], image["tile_of"])
+        context = Context(gaussians, view, P, behind, (height, width), splats, entries, segments, image["last"])
         return RenderedFrame(image["colors"], image["alphas"], image["depths"], splats.radii, context)
 
     def backward(
@@ -187,8 +186,8 @@ class DeviceBackend:
             "colors": torch.empty(height, width, 3, device=self.device),
             "alphas": torch.empty(height, width, device=self.device),
             "depths": torch.empty(height, width, device=self.device) if depth else None,
-            "transmittance": torch.empty(height, width, device=self.device),
             "last": torch.empty(height, width, dtype=torch.int32, device=self.device),
+            **vars(Segments.of(entries)),
         }
         self._launch("blend", _pixels(size), **_lists(splats, entries, size, behind), **image)
         return image
@@ -199,11 +198,11 @@ class DeviceBackend:
         sums = torch.empty(len(context.entries.slots), SUM_FIELDS, device=self.device)
         self._launch(
             "blend_backward",
-            _pixels(context.size),
+            len(context.segments.tile_of) * THREADS,
             **_lists(context.splats, context.entries, context.size, context.background),
             slots=context.entries.slots,
-            transmittance=context.transmittance,
             last=context.last,
+            **vars(context.segments),
             v_colors=contiguous(v_colors),
             v_alphas=contiguous(v_alphas),
             v_depths=contiguous(v_depths),

@@ -1,4 +1,6 @@
-// The gradient of compositing, back to front (docs/math.md, 9 to 11). One block, one tile.
+// The gradient of compositing, back to front (docs/math.md, 9 to 11). One block, one segment of a tile's list: what lies
+// behind a segment is what all of the list adds to a pixel, less what it added up to there (as Mallick et al. 2024,
+// "Taming 3DGS", have it for groups of 32).
 //
 // A few splats at a time: first a thread is a pixel and finds what each of these splats pulls at it, then a thread is a
 // splat and a column of pixels and adds up. Every (splat, tile) pair has a row of sums of its own, which one thread
@@ -14,12 +16,13 @@ struct BlendBackwardArguments {
   GLOBAL const Record* records;
   GLOBAL const int *tile_begin, *ids;  // as in BlendArguments
   GLOBAL const Index* slots;           // [entries] where the row of an entry goes
-  GLOBAL const float* transmittance;
-  GLOBAL const int* last;
+  GLOBAL const int *last, *tile_of;                     // as in BlendArguments; -1: nothing to do
+  GLOBAL const float* ends;
   GLOBAL const float *v_colors, *v_alphas, *v_depths;  // the last two may be null
   GLOBAL Sums* sums;                                   // [slots]
 };
 
+constexpr int kGroup = 4 * kBatch;  // splats that a block reads at a time
 constexpr int kPitch = kThreads + kTile;  // so that two splats' pixels lie in different banks
 static_assert(kThreads >= kBatch * kTile, "a thread for every splat and column");
 
@@ -29,11 +32,19 @@ struct Pull {
   int last;
 };
 
-inline Pull pull_of(const BlendBackwardArguments& a, Index at) {
+inline End end_of(GLOBAL const float* ends, int segment, int t) {
+  GLOBAL const float* at = ends + static_cast<Index>(segment) * kEndFields * kThreads + t;
+  return {at[0], at[kThreads], at[2 * kThreads], at[3 * kThreads], at[4 * kThreads]};
+}
+
+// At the end of a segment, `all` being the end of the list.
+inline Pull pull_of(const BlendBackwardArguments& a, Index at, End here, End all) {
   const Vec3<float> g = load3(a.v_colors, at);
-  const float behind = g.x * a.background[0] + g.y * a.background[1] + g.z * a.background[2];
-  return {a.transmittance[at], behind - (a.v_alphas ? a.v_alphas[at] : 0.f), g.x, g.y, g.z,
-      a.v_depths ? a.v_depths[at] : 0.f, a.last[at]};
+  const float depth = a.v_depths ? a.v_depths[at] : 0.f, alpha = a.v_alphas ? a.v_alphas[at] : 0.f;
+  const float background = g.x * a.background[0] + g.y * a.background[1] + g.z * a.background[2] - alpha;
+  const float later =
+      g.x * (all.r - here.r) + g.y * (all.g - here.g) + g.z * (all.b - here.b) + depth * (all.depth - here.depth);
+  return {here.T, later / here.T + all.T / here.T * background, g.x, g.y, g.z, depth, a.last[at]};
 }
 
 // What the splats of a batch are at every pixel; then, in the same memory, the sums of every thread.
@@ -91,50 +102,66 @@ inline Sums column_sums(
   return out;
 }
 
+// Field t % kRowFields of splat t / kRowFields, over its columns.
+inline float total(IN_BLOCK const Scratch& in, int t) {
+  float sum = 0.f;
+  for (int x = 0; x < kTile; ++x) sum += in.sums[t / kRowFields * kTile + x][t % kRowFields];
+  return sum;
+}
+
 KERNEL(blend_backward, BlendBackwardArguments) {
-  SHARED Row rows[kBatch];
+  SHARED Row rows[kGroup];
+  SHARED Index slots[kGroup];
   SHARED Scratch scratch;
   SHARED float g[4][kThreads];
   SHARED int deepest;
   Own<Pull> pull;
   Own<Sums> column;
-  const Tile tile(block(), a.tiles_x, a.width, a.height);
-  const int begin = a.tile_begin[block()], end = a.tile_begin[block() + 1];
+  const int number = a.tile_of[block()];
+  if (number < 0) return;
+  const Tile tile(number, a.tiles_x, a.width, a.height);
+  const int begin = a.tile_begin[number], end = a.tile_begin[number + 1], segment = first_segment(number, begin);
+  const int start = (block() - segment) * kSegment;
   PHASE(t) {
     if (t == 0) deepest = 0;
-    if (tile.has(t)) {
-      pull[t] = pull_of(a, tile.pixel(t));
-    } else {
-      pull[t] = {};
-    }
+  }
+  PHASE(t) {
+    if (tile.has(t)) shared_max(&deepest, a.last[tile.pixel(t)]);
+  }
+  PHASE(t) {  // what no pixel took
+    if (start == 0)
+      for (int k = begin + deepest + t; k < end; k += kThreads) a.sums[a.slots[k]] = {};
+    pull[t] = {};
+    if (deepest > start && tile.has(t))
+      pull[t] = pull_of(a, tile.pixel(t), end_of(a.ends, block(), t),
+          end_of(a.ends, segment + (deepest - 1) / kSegment, t));
     g[0][t] = pull[t].r;
     g[1][t] = pull[t].g;
     g[2][t] = pull[t].b;
     g[3][t] = pull[t].depth;
   }
-  PHASE(t) { shared_max(&deepest, pull[t].last); }
-  PHASE(t) {  // what no pixel took
-    for (int k = begin + deepest + t; k < end; k += kThreads) a.sums[a.slots[k]] = {};
-  }
-  for (int first = (deepest + kBatch - 1) / kBatch * kBatch - kBatch; first >= 0; first -= kBatch) {
-    const int n = deepest - first < kBatch ? deepest - first : kBatch;
+  const int stop = deepest < start + kSegment ? deepest : start + kSegment;
+  if (stop <= start) return;
+  for (int group = start + (stop - 1 - start) / kGroup * kGroup; group >= start; group -= kGroup) {
+    const int read = stop - group < kGroup ? stop - group : kGroup;
     PHASE(t) {
-      if (t < n) rows[t] = row_of(a.records[a.ids[begin + first + t]], tile);
+      if (t < read) {
+        rows[t] = row_of(a.records[a.ids[begin + group + t]], tile);
+        slots[t] = a.slots[begin + group + t];
+      }
     }
-    PHASE(t) { pull_splats(rows, n, first, t, pull[t], scratch); }
-    PHASE(t) {
-      if (t / kTile < n) column[t] = column_sums(rows[t / kTile], scratch, g, t / kTile, t % kTile);
-    }
-    PHASE(t) {
-      if (t / kTile < n)
-        for (int f = 0; f < kRowFields; ++f) scratch.sums[t][f] = column[t].at[f];
-    }
-    PHASE(t) {
-      if (t < n * kRowFields) {
-        const int j = t / kRowFields, f = t % kRowFields;
-        float sum = 0.f;
-        for (int x = 0; x < kTile; ++x) sum += scratch.sums[j * kTile + x][f];
-        a.sums[a.slots[begin + first + j]].at[f] = sum;
+    for (int first = (read - 1) / kBatch * kBatch; first >= 0; first -= kBatch) {
+      const int n = read - first < kBatch ? read - first : kBatch;
+      PHASE(t) { pull_splats(rows + first, n, group + first, t, pull[t], scratch); }
+      PHASE(t) {
+        if (t / kTile < n) column[t] = column_sums(rows[first + t / kTile], scratch, g, t / kTile, t % kTile);
+      }
+      PHASE(t) {
+        if (t / kTile < n)
+          for (int f = 0; f < kRowFields; ++f) scratch.sums[t][f] = column[t].at[f];
+      }
+      PHASE(t) {
+        if (t < n * kRowFields) a.sums[slots[first + t / kRowFields]].at[t % kRowFields] = total(scratch, t);
       }
     }
   }

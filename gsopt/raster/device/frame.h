@@ -61,11 +61,21 @@ struct alignas(16) Sums {
   float at[kRowFields];
 };
 
-// An image and the tile of a block.
+// A tile's list is cut into segments: on the way back each is a block's. They are numbered tile by tile, with gaps.
+constexpr int kSegment = kThreads;  // splats
+inline int first_segment(int tile, int begin) { return begin / kSegment + tile; }
+
+// What a pixel has taken when a segment ends.
+struct End {
+  float T, r, g, b, depth;
+};
+constexpr int kEndFields = 5;
+
+// An image and one tile of it.
 struct Tile {
   int x, y, width, height;  // its first pixel; the image
-  Tile(int block, int tiles_x, int width_, int height_)
-      : x(block % tiles_x * kTile), y(block / tiles_x * kTile), width(width_), height(height_) {}
+  Tile(int number, int tiles_x, int width_, int height_)
+      : x(number % tiles_x * kTile), y(number / tiles_x * kTile), width(width_), height(height_) {}
   bool has(int t) const { return x + t % kTile < width && y + t / kTile < height; }
   Index pixel(int t) const { return static_cast<Index>(y + t / kTile) * width + x + t % kTile; }
 };

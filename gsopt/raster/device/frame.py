@@ -12,10 +12,12 @@ from torch import Tensor
 
 from gsopt.errors import NumericalError, UsageError
 from gsopt.gaussians import Gaussians
+from gsopt.raster.device.runtime import THREADS
 
 TILE = 16
 RECORD_FLOATS = 12
 SUM_FIELDS = 12
+END_FIELDS = 5
 MOST_SHORT_TILES = 32_767
 MOST_ENTRIES = 2**31 - 1
 
@@ -98,6 +100,23 @@ class Entries:
 
 
 @dataclass
+class Segments:
+    """Stretches of THREADS splats of the tiles' lists, on the way back a block each: numbered as in frame.h."""
+
+    ends: Float[Tensor, "S 5 256"]
+    """State of the pixels of the tile where a segment ends."""
+    tile_of: Int[Tensor, " S"]
+    """The segment's tile, -1 where nothing is drawn."""
+
+    @staticmethod
+    def of(entries: Entries) -> Segments:
+        """Room for as many as there can be."""
+        count, device = len(entries.ids) // THREADS + len(entries.tile_begin) - 1, entries.ids.device
+        ends = torch.empty(count, END_FIELDS, THREADS, device=device)
+        return Segments(ends, torch.full((count,), -1, dtype=torch.int32, device=device))
+
+
+@dataclass
 class Context:
     """All that `backward` reads."""
 
@@ -109,7 +128,7 @@ class Context:
     """Height and width, px."""
     splats: Splats
     entries: Entries
-    transmittance: Float[Tensor, "H W"]
+    segments: Segments
     last: Int[Tensor, "H W"]
     used: bool = field(default=False)
 

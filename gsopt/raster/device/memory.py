@@ -10,12 +10,12 @@ from gsopt.errors import NumericalError
 
 TILES_PER_SPLAT = 6
 """Tiles of 16 px that a splat touches on average; scenes of the kernel benchmark have 2 to 6."""
-ENTRY_BYTES = 96
-"""A pair of a splat and a tile: its row of sums, its number, and what the sort takes."""
+ENTRY_BYTES = 116
+"""A pair of a splat and a tile: its row of sums, its number, its part of a segment, and what the sort takes."""
 SPLAT_BYTES = 160
 """A splat: its record, keys, slots, and what the sort takes."""
-PIXEL_BYTES = 120
-"""A pixel: the image, its gradient, the loss's maps and a target."""
+PIXEL_BYTES = 136
+"""A pixel: the image, its gradient, the loss's maps, a target, and the end of its tile's first segment."""
 CONTEXT_BYTES = 600_000_000
 """The driver's own, with the kernels' code."""
 PRIOR_BYTES = 1_000_000_000
