@@ -8,11 +8,11 @@ struct BlendArguments {
   int width, height, tiles_x;
   float background[3];
   GLOBAL const Record* records;
-  GLOBAL const int *tile_begin, *ids;  // [tiles + 1] first entry of a tile; [entries] the splat of an entry
-  GLOBAL float *colors, *alphas, *depths;               // depths may be null
-  GLOBAL int* last;     // [pixels] number in its tile, from 1, of the last splat that a pixel took
-  GLOBAL float* ends;   // [segments, kEndFields, kThreads]
-  GLOBAL int* tile_of;  // [segments]; stays as it is for those that no pixel needs
+  GLOBAL const int *tile_begin, *ids;      // [tiles + 1] first entry of a tile; [entries] the splat of an entry
+  GLOBAL float *colors, *alphas, *depths;  // depths may be null
+  GLOBAL int* last;                        // [pixels] number in its tile, from 1, of the last splat that a pixel took
+  GLOBAL float* ends;                      // [segments, kEndFields, kThreads]
+  GLOBAL int* tile_of;                     // [segments]; stays as it is for those that no pixel needs
 };
 
 struct Pixel {

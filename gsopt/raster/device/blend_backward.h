@@ -1,6 +1,6 @@
-// The gradient of compositing, back to front (docs/math.md, 9 to 11). One block, one segment of a tile's list: what lies
-// behind a segment is what all of the list adds to a pixel, less what it added up to there (as Mallick et al. 2024,
-// "Taming 3DGS", have it for groups of 32).
+// The gradient of compositing, back to front (docs/math.md, 9 to 11). One block, one segment of a tile's list: what
+// lies behind a segment is what all of the list adds to a pixel, less what it added up to there (as Mallick et al.
+// 2024, "Taming 3DGS", have it for groups of 32).
 //
 // A few splats at a time: first a thread is a pixel and finds what each of these splats pulls at it, then a thread is a
 // splat and a column of pixels and adds up. Every (splat, tile) pair has a row of sums of its own, which one thread
@@ -16,13 +16,13 @@ struct BlendBackwardArguments {
   GLOBAL const Record* records;
   GLOBAL const int *tile_begin, *ids;  // as in BlendArguments
   GLOBAL const Index* slots;           // [entries] where the row of an entry goes
-  GLOBAL const int *last, *tile_of;                     // as in BlendArguments; -1: nothing to do
+  GLOBAL const int *last, *tile_of;    // as in BlendArguments; -1: nothing to do
   GLOBAL const float* ends;
   GLOBAL const float *v_colors, *v_alphas, *v_depths;  // the last two may be null
   GLOBAL Sums* sums;                                   // [slots]
 };
 
-constexpr int kGroup = 4 * kBatch;  // splats that a block reads at a time
+constexpr int kGroup = 4 * kBatch;        // splats that a block reads at a time
 constexpr int kPitch = kThreads + kTile;  // so that two splats' pixels lie in different banks
 static_assert(kThreads >= kBatch * kTile, "a thread for every splat and column");
 
@@ -133,8 +133,8 @@ KERNEL(blend_backward, BlendBackwardArguments) {
       for (int k = begin + deepest + t; k < end; k += kThreads) a.sums[a.slots[k]] = {};
     pull[t] = {};
     if (deepest > start && tile.has(t))
-      pull[t] = pull_of(a, tile.pixel(t), end_of(a.ends, block(), t),
-          end_of(a.ends, segment + (deepest - 1) / kSegment, t));
+      pull[t] =
+          pull_of(a, tile.pixel(t), end_of(a.ends, block(), t), end_of(a.ends, segment + (deepest - 1) / kSegment, t));
     g[0][t] = pull[t].r;
     g[1][t] = pull[t].g;
     g[2][t] = pull[t].b;
