@@ -3,7 +3,8 @@
 The changes are chosen by the seed alone, nobody picks them. A change meets the tests that run its line (`make mutants`
 records which do), the quick ones first, until one fails; a test counts only if it passes without the change. Survivors
 are printed with their line: a law is missing, or the change is harmless. A campaign that was cut goes on from its
-`--json`.
+`--json`. While laws are written for one module, `mutate.py MODULE --tests FILE --count 9999` tries all of its changes
+on the tests of one file, a second or two each.
 """
 
 from __future__ import annotations
@@ -65,8 +66,11 @@ def main() -> None:
         "--json", type=_absolute, help="file for the outcome of every change; what it has is not done again"
     )
     parser.add_argument("--traces", type=_absolute, help="folder with the coverage and junit.xml of the tests")
+    parser.add_argument("--tests", nargs="+", default=[], help="files of tests, instead of those that run the line")
     parser.add_argument("--print-tests", action="store_true", help="print the folders of all tests, and end")
     options = parser.parse_args()
+    if missing := [name for name in options.tests if not (ROOT / name).is_file()]:
+        parser.error(f"no such file of tests: {missing[0]}")
     if options.print_tests:
         print(*TESTS.values(), ALSO_RUN)
         return
@@ -76,14 +80,15 @@ def main() -> None:
     ]
     possible = [mutant for file in wanted for mutant in mutants_of(file)]
     chosen = random.Random(options.seed).sample(possible, min(options.count, len(possible)))
-    outcomes, traces = resumed(options.json, options.seed), Traces(options.traces)
+    outcomes = resumed(options.json, options.seed)
+    traces = None if options.tests else Traces(options.traces)
     with tempfile.TemporaryDirectory() as folder:
         judge = Judge(Path(folder) / "copy")
         for mutant in chosen:
             if any(asdict(mutant).items() <= outcome.items() for outcome in outcomes):
                 continue
             began = time.monotonic()
-            tests = traces.tests_of(mutant, mirror_of(ROOT / mutant.file))
+            tests = traces.tests_of(mutant, mirror_of(ROOT / mutant.file)) if traces else options.tests
             noticed_by = judge.noticed_by(mutant, tests)
             seconds = round(time.monotonic() - began, 1)
             outcomes.append({**asdict(mutant), "noticed_by": noticed_by, "tests": len(tests), "seconds": seconds})

@@ -99,3 +99,11 @@ def test_a_change_that_no_test_checks_is_printed(project: Path) -> None:
     printed = mutate(project, "gsopt/events.py", "--count", "9", "--traces", "traces").splitlines()
     assert printed[:-1] == ["gsopt/events.py:6: '41' became '42': none of 1 tests noticed"]
     assert printed[-1].startswith("2 of 3 noticed, of 3 possible")
+
+
+def test_named_tests_meet_every_change_without_a_trace(project: Path) -> None:
+    (project / "tests" / "mutants" / "coverage.py").unlink()
+    (project / "tests" / "test_other.py").write_text("from test_events import test_a_double_is_twice_as_much\n")
+    printed = mutate(project, "gsopt/events.py", "--count", "9", "--tests", "tests/test_other.py").splitlines()
+    assert printed[0] == "gsopt/events.py:6: '41' became '42': none of 1 tests noticed"
+    assert printed[-1].startswith("2 of 3 noticed, of 3 possible")

@@ -9,7 +9,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from changes import ROOT, Mutant
-from coverage import CoverageData
 
 MAX_SECONDS = 60.0
 """Tests of a change, by the time that they took without it; the quick ones come first."""
@@ -17,6 +16,8 @@ MAX_SECONDS = 60.0
 
 class Traces:
     def __init__(self, folder: Path) -> None:
+        from coverage import CoverageData  # only `make mutants` installs it
+
         self._data = CoverageData(str(folder / "coverage"))
         self._data.read()
         self._seconds: defaultdict[str, float] = defaultdict(float)
