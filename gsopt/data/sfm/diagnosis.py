@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 
 from gsopt.data.sfm.features import ViewGraph
 from gsopt.data.sfm.photos import Photo, RejectedFile, natural
@@ -172,6 +172,40 @@ def wide_gaps(names: Sequence[str], viewmats: Float[np.ndarray, "C 4 4"]) -> lis
         f"Add photos between {names[i]} and {names[i + 1]}: their directions differ by {turns[i]:.0f} degrees."
         for i in np.flatnonzero(turns > limit)[:5]
     ]
+
+
+def hinge(names: Sequence[str], shared: Int64[np.ndarray, "C C"]) -> list[str]:
+    """Two or more photos that share points with the rest (`shared`: how many each pair does) through one photo alone:
+    where that is off, all of them are, and their points do not show it."""
+    linked = shared >= MIN_COMMON_FEATURES
+    everyone = np.ones(len(names), dtype=bool)
+    if len(names) == 0 or not _reached(linked, everyone).all():
+        return []
+    hanging, at = np.zeros(len(names), dtype=bool), -1
+    for i in range(len(names)):
+        others = everyone.copy()
+        others[i] = False
+        while others.any():
+            part = _reached(linked, others)
+            others &= ~part
+            if hanging.sum() < part.sum() <= (len(names) - 1) // 2:
+                hanging, at = part, i
+    if hanging.sum() < 2:  # the first and the last photo of an arc may have one neighbor
+        return []
+    listed = _listed([name for name, hangs in zip(names, hanging, strict=True) if hangs])
+    return [
+        f"{listed} share points with the other photos through {names[at]} alone: where its pose is off, theirs are. "
+        f"Add photos on both sides of {names[at]}."
+    ]
+
+
+def _reached(linked: Bool[np.ndarray, "C C"], among: Bool[np.ndarray, "C"]) -> Bool[np.ndarray, "C"]:
+    """The photos among these that links join to the first of them."""
+    reached = np.zeros_like(among)
+    reached[np.argmax(among)] = True
+    while (grown := (reached | linked[reached].any(0)) & among).sum() > reached.sum():
+        reached = grown
+    return reached
 
 
 def split_groups(graph: ViewGraph, registered: set[str]) -> list[str]:

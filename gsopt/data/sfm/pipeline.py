@@ -7,13 +7,14 @@ Nothing is left behind but the finished folder: all work happens under a hidden 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from gsopt._optional import require
 from gsopt._version import __version__
@@ -149,6 +150,7 @@ class _Run:
         report.advice += found.notes + diagnosis.split_groups(found.graph, mapped.names)
         names, viewmats = poses(mapped.reconstruction)
         report.advice += diagnosis.wide_gaps(names, viewmats)
+        report.advice += diagnosis.hinge(names, shared_points(mapped.reconstruction, names))
         return report
 
     def _placed(self, mapped: MappingResult, frames: list[PosedImage] | None) -> Similarity:
@@ -197,6 +199,16 @@ def points(reconstruction: Any) -> tuple[Float[np.ndarray, "P 3"], Any]:
     found = list(reconstruction.points3D.values())
     xyz = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in found], dtype=np.uint8).reshape(-1, 3)
+
+
+def shared_points(reconstruction: Any, names: Sequence[str]) -> Int64[np.ndarray, "C C"]:
+    """The number of points that each pair of photos has in common; rows in the order of the names."""
+    rows = {i: names.index(reconstruction.image(i).name) for i in reconstruction.reg_image_ids()}
+    shared = np.zeros((len(names), len(names)), dtype=np.int64)
+    for point in reconstruction.points3D.values():
+        track = sorted({rows[element.image_id] for element in point.track.elements})
+        shared[np.ix_(track, track)] += 1
+    return shared
 
 
 def fingerprint(source: Path) -> list[list[Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import pytest
 import textured_room as room
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import Int64
 
 from gsopt.data.sfm import diagnosis, mapping
 from gsopt.data.sfm.features import ViewGraph, choose_matching, neighbors_in_time, reader_options
@@ -90,6 +92,33 @@ def test_a_wide_turn_between_neighbors_is_pointed_out() -> None:
     assert diagnosis.wide_gaps([str(i) for i in range(7)], viewmats) == []
     (advice,) = diagnosis.wide_gaps(["a", "b", "c", "d"], np.stack([*viewmats[:3], room.arc(2, spread=75).numpy()[1]]))
     assert advice.startswith("Add photos between c and d: their directions differ by ")
+
+
+def sharing(groups: Sequence[str], count: int = 30) -> Int64[np.ndarray, "7 7"]:
+    """Counts for photos 0 to 6: those of a group share so many points with each other."""
+    shared = np.zeros((7, 7), dtype=np.int64)
+    for group in groups:
+        shared[np.ix_([int(i) for i in group], [int(i) for i in group])] = count
+    return shared
+
+
+def test_photos_that_hang_on_one_other_photo_are_named() -> None:
+    """The smaller side of the one photo is named; where a second photo joins it too, nothing is."""
+    names = [f"{i}.jpg" for i in range(7)]
+    (advice,) = diagnosis.hinge(names, sharing(["01234", "456"]))
+    assert advice.startswith("5.jpg, 6.jpg share points with the other photos through 4.jpg alone")
+    assert advice.endswith("Add photos on both sides of 4.jpg.")
+    (weakly,) = diagnosis.hinge(names, np.maximum(sharing(["01234", "456"]), sharing(["0123456"], 29)))
+    assert weakly == advice
+    assert diagnosis.hinge(names, sharing(["01234", "456", "26"])) == []
+    assert diagnosis.hinge(names, sharing(["012345", "56"])) == []  # one photo at the end
+    assert diagnosis.hinge(names, sharing(["0123", "456"])) == []  # points are rare between all of them
+    assert diagnosis.hinge([], np.zeros((0, 0), dtype=np.int64)) == []
+
+
+def test_of_several_photos_that_others_hang_on_the_one_that_carries_most_is_named() -> None:
+    (advice,) = diagnosis.hinge([str(i) for i in range(7)], sharing(["01", "12", "23", "34", "45", "56"]))
+    assert advice.startswith("0, 1, 2 share points with the other photos through 3 alone")
 
 
 def test_refusals_offer_the_object_path_only_where_it_can_help() -> None:

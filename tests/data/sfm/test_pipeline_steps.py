@@ -86,11 +86,13 @@ def test_the_figures_of_a_reconstruction_and_all_advice_are_in_its_diagnosis(
     monkeypatch.setattr(pipeline, "poses", lambda found: (list(NAMES[:4]), "viewmats"))
     monkeypatch.setattr(pipeline.diagnosis, "split_groups", lambda graph, placed: [f"{len(placed)} in a group"])
     monkeypatch.setattr(pipeline.diagnosis, "wide_gaps", lambda names, viewmats: [f"{len(names)} with {viewmats}"])
+    monkeypatch.setattr(pipeline, "shared_points", lambda found, names: len(names))
+    monkeypatch.setattr(pipeline.diagnosis, "hinge", lambda names, shared: [f"{len(names)} share {shared}"])
     mapped = MappingResult(made, "global", [])
     found = FoundPoses(graph(CHAIN), mapped, "sift", ["note"])
     report = run(tmp_path, [])._diagnose([photo(name) for name in NAMES[:4]], [], found, mapped)
     assert (report.mapper, report.reprojection_error, report.track_length, report.points) == ("global", 0.5, 4.5, 77)
-    assert report.advice[-3:] == ["note", "4 in a group", "4 with viewmats"]
+    assert report.advice[-4:] == ["note", "4 in a group", "4 with viewmats", "4 share 4"]
 
 
 def test_points_are_positions_and_colors_also_where_there_are_none() -> None:
@@ -99,6 +101,19 @@ def test_points_are_positions_and_colors_also_where_there_are_none() -> None:
     assert (xyz.tolist(), rgb.tolist()) == ([[1, 2, 3]] * 2, [[4, 5, 6]] * 2)
     assert (xyz.dtype, rgb.dtype) == (np.float64, np.uint8)
     assert [found.shape for found in pipeline.points(SimpleNamespace(points3D={}))] == [(0, 3), (0, 3)]
+
+
+def test_shared_points_are_counted_once_per_pair_in_the_order_of_the_names() -> None:
+    tracks = [(3, 5), (5, 3, 3), (5, 8)]
+    seen = [[SimpleNamespace(image_id=i) for i in ids] for ids in tracks]
+    points = [SimpleNamespace(track=SimpleNamespace(elements=elements)) for elements in seen]
+    names = {3: "c.jpg", 5: "a.jpg", 8: "b.jpg"}
+    made = SimpleNamespace(
+        reg_image_ids=lambda: list(names),
+        image=lambda i: SimpleNamespace(name=names[i]),
+        points3D=dict(enumerate(points)),
+    )
+    assert pipeline.shared_points(made, ["a.jpg", "b.jpg", "c.jpg"]).tolist() == [[3, 1, 2], [1, 1, 0], [2, 0, 2]]
 
 
 def test_a_fingerprint_has_name_size_and_time_of_photos_and_of_files_in_the_folder_of_masks(tmp_path: Path) -> None:

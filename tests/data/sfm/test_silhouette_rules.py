@@ -46,6 +46,21 @@ def test_outline_pixels_are_evenly_spaced_around_a_disk(radius: int) -> None:
     assert apart.max() < 2.2 * 2 * math.pi / len(angles)
 
 
+def test_a_near_point_has_its_distance_and_one_behind_the_camera_is_far_outside() -> None:
+    intrinsics = torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]])
+    outline = Outline.of(Cameras(torch.eye(4)[None], intrinsics, 64, 64), torch.ones(1, 64, 64))
+    points = torch.tensor([[0.0, 0, 0.01], [0, 0, 0.5], [0, 0, 0], [0, 0, -1]])
+    assert outline.at(points).tolist() == pytest.approx(
+        [MAX_DISTANCE, MAX_DISTANCE, -MAX_DISTANCE, -MAX_DISTANCE], abs=0.5
+    )
+
+
+@pytest.mark.parametrize(("height", "finer"), [(256, 4), (257, 2)])
+def test_the_longer_side_decides_how_fine_an_outline_lies(height: int, finer: int) -> None:
+    outline = Outline.of(Cameras(torch.eye(4)[None], torch.eye(3)[None], 40, height), torch.ones(1, height, 40))
+    assert outline.distance.shape == (1, finer * height, finer * 40)
+
+
 def test_the_ball_around_an_object_is_the_ball_that_is_seen(coherence: Coherence) -> None:
     assert coherence.center.tolist() == pytest.approx(BALL.center, abs=0.02)
     assert coherence.radius == pytest.approx(BALL.radius, rel=0.05)
