@@ -4,7 +4,7 @@ The changes are chosen by the seed alone, nobody picks them. A change meets the 
 records which do), the quick ones first, until one fails; a test counts only if it passes without the change. Survivors
 are printed with their line: a law is missing, or the change is harmless. A campaign that was cut goes on from its
 `--json`. While laws are written for one module, `mutate.py MODULE --tests FILE --count 9999` tries all of its changes
-on the tests of one file, a second or two each.
+on the tests of one file, in the time that they take.
 """
 
 from __future__ import annotations

@@ -107,3 +107,9 @@ def test_named_tests_meet_every_change_without_a_trace(project: Path) -> None:
     printed = mutate(project, "gsopt/events.py", "--count", "9", "--tests", "tests/test_other.py").splitlines()
     assert printed[0] == "gsopt/events.py:6: '41' became '42': none of 1 tests noticed"
     assert printed[-1].startswith("2 of 3 noticed, of 3 possible")
+
+
+def test_a_file_of_tests_that_is_not_there_is_told(project: Path) -> None:
+    """None of no tests would notice anything."""
+    with pytest.raises(AssertionError, match=r"no such file of tests: tests/other\.py"):
+        mutate(project, "gsopt/events.py", "--tests", "tests/other.py")

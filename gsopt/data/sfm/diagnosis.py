@@ -203,8 +203,10 @@ def _reached(linked: Bool[np.ndarray, "C C"], among: Bool[np.ndarray, "C"]) -> B
     """The photos among these that links join to the first of them."""
     reached = np.zeros_like(among)
     reached[np.argmax(among)] = True
-    while (grown := (reached | linked[reached].any(0)) & among).sum() > reached.sum():
-        reached = grown
+    new = reached
+    while new.any():
+        new = linked[new].any(0) & among & ~reached
+        reached = reached | new
     return reached
 
 
