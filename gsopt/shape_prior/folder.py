@@ -93,7 +93,7 @@ def _described(folder: Path) -> dict[str, Any]:
     if not is_regular(folder / CARD_FILE):
         raise InputError(
             f"{folder} holds no shape prior: {CARD_FILE} is missing. Train one with `gsopt finetune --shape`; gsopt "
-            "ships none, because none has been trained on a GPU."
+            "ships none, because none has beaten the shape library."
         )
     try:
         return read_json(folder / CARD_FILE)
