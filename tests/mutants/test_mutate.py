@@ -48,8 +48,10 @@ COVERAGE = """class CoverageData:
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A copy of the tool over a module with two places that one test checks, and one that none does."""
+    """A copy of the tool over a module with two places that one test checks, and one that none does. It has settings
+    of its own: without them pytest takes those of any folder above, and names the tests from there."""
     files = {
+        "pyproject.toml": "[tool.pytest.ini_options]\n",
         "gsopt/__init__.py": "",
         "gsopt/events.py": MODULE,
         "tests/test_events.py": TEST,
