@@ -80,7 +80,7 @@ wheel:
 # compile; tests of the reference alone have no kernel to check. -S and -P: neither the editable install nor the sources are
 # imported instead of the build; --capture=sys leaves a sanitizer's report visible. The text for Metal jumps between stacks,
 # which the address sanitizer does not follow; the same kernels are checked as `simt`.
-KERNEL_TESTS := $(filter-out tests/raster/test_reference% tests/raster/test_device_compiles.py tests/raster/test_gpu_% tests/raster/test_metal_% tests/raster/test_mps_%,$(wildcard tests/raster/test_*.py)) tests/init/stereo/test_matching.py
+KERNEL_TESTS := $(filter-out tests/raster/test_reference% tests/raster/test_device_compiles.py tests/raster/test_gpu_% tests/raster/test_metal_% tests/raster/test_mps_%,$(wildcard tests/raster/test_*.py)) tests/init/stereo/test_matching.py tests/data/test_lookup.py
 sanitize: $(VENV)/.for-test
 	$(PIP) --no-build-isolation --no-deps --upgrade --target build/sanitized -C build-dir=build/sanitized-objects \
 	  -C cmake.define.CMAKE_CXX_FLAGS="$(SANITIZE)" -C cmake.define.GSOPT_OPTIMIZE=-O1 .

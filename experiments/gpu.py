@@ -3,8 +3,8 @@
     python experiments/gpu.py --lego DATA            # on a GPU; DATA: NeRF-synthetic's lego at 400 px
     python experiments/gpu.py --tiny --out OUT.json  # the same on this CPU, a thread at a time, in a minute
 
-Each part is written as soon as it is known. No compiler is needed and not gsopt's own extension: torch, numpy, pillow,
-plyfile, safetensors, jaxtyping, hypothesis and pytest; diffusers and transformers for the last part.
+Each part is written as soon as it is known. No compiler is needed, but the extension of a wheel in gsopt/raster, torch,
+numpy, pillow, plyfile, safetensors, jaxtyping, hypothesis and pytest; diffusers and transformers for the last part.
 """
 
 from __future__ import annotations

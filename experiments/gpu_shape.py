@@ -6,8 +6,8 @@
 
 The first steps are timed, and as many planned as fit the budget beside the evaluation. FOLDER gets plan.json,
 prior/ (for gsopt train --prior shape:FOLDER/prior) with train.jsonl, and result.json: IoU and silhouette errors on
-held-out shapes beside the inflated silhouette and the library. It needs torch, numpy, pillow, plyfile, safetensors and
-jaxtyping, no compiler and not gsopt's own extension.
+held-out shapes beside the inflated silhouette and the library. It needs torch, numpy, pillow, plyfile, safetensors,
+jaxtyping and the extension of a wheel in gsopt/raster, but no compiler.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def _settings_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
     if info.type is not TrainConfig and info.type not in SECTIONS:
         return None
     section, hints = SECTIONS.get(info.type, ""), typing.get_type_hints(info.type)
-    docstrings, flags = _docstrings(info.type), []
+    flags = []
     for item in fields(info.type):
         name = f"{section}.{item.name}" if section else item.name
         if name == POSITIONAL:
@@ -126,7 +126,7 @@ def _settings_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
         hint, default = _flag_type(name, hints[item.name]), getattr(info.default, item.name)
         if name == "iterations":  # given ones hold for few views too, those of a preset do not
             hint, default = Annotated[int | None, *typing.get_args(hint)[1:]], None
-        flags.append(StructFieldSpec(item.name, hint, default, functools.partial(docstrings.get, item.name)))
+        flags.append(StructFieldSpec(item.name, hint, default, functools.partial(_docstring, info.type, item.name)))
     return StructConstructorSpec(TrainConfig.of if info.type is TrainConfig else info.type, tuple(flags))
 
 
@@ -156,6 +156,12 @@ def _view_ids() -> PrimitiveConstructorSpec[Any]:
     )
 
 
+def _docstring(cls: type, name: str) -> str | None:
+    """The docstring of a field, read when it is printed."""
+    return _docstrings(cls).get(name)
+
+
+@functools.cache
 def _docstrings(cls: type) -> dict[str, str]:
     """The docstring of each field, on one line."""
     body = ast.parse(inspect.getsource(cls)).body[0].body  # type: ignore[attr-defined]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gsopt.data.distances import squared_distance
+from gsopt.data.lookup import Picture, lowest
 from gsopt.data.resample import sample
 from gsopt.geometry.cameras import Cameras
-from gsopt.geometry.projection import project
 
 PIXELS_PER_PHOTO = 120
 """Outline pixels that are compared, evenly spaced."""
@@ -38,10 +39,12 @@ class Outline:
 
     def at(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
         """Signed distance of projected points, px; far outside behind the camera."""
-        column, row, depth = project(self.camera, points.reshape(-1, 3))
-        before = depth > 1e-6
-        column, row = (torch.where(before, coordinate, 0.0) for coordinate in (column, row))
-        return torch.where(before, self.here(column, row), -float(MAX_DISTANCE)).view(points.shape[:-1])
+        return lowest([self.picture], points)[0]
+
+    @cached_property
+    def picture(self) -> Picture:
+        """The signed distance; far outside behind the camera."""
+        return Picture(self.camera, self.distance[0], unseen=-float(MAX_DISTANCE))
 
     def here(self, column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Signed distance at pixel coordinates, px."""

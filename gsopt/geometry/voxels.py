@@ -23,6 +23,11 @@ class Grid:
         """Centers of the true cells; of the occupied ones when not given."""
         return self.low + (torch.nonzero(self.occupied if cells is None else cells) + 0.5) * self.voxel
 
+    def all_centers(self) -> Float[Tensor, "N 3"]:
+        """Centers of all cells, in the order of `occupied`."""
+        sides = enumerate(self.occupied.shape)
+        return torch.cartesian_prod(*(self.low[axis] + (torch.arange(size) + 0.5) * self.voxel for axis, size in sides))
+
     def surface(self) -> Float[Tensor, "M 3"]:
         """Centers of the occupied voxels that have one of their 26 neighbors free."""
         return self.centers(self.occupied & ~eroded(self.occupied))

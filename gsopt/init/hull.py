@@ -15,9 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsopt.data.resample import sample
+from gsopt.data.lookup import Picture, lowest
 from gsopt.data.scene import Scene
-from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import Focus, find_focus
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated, eroded
@@ -43,6 +42,10 @@ _MIN_SIDE, _MAX_SIDE = 48, 112
 """Voxels along each side of the second grid."""
 _SOLID_ALPHA = 0.5
 """Alpha above which a pixel belongs to the object."""
+_CARVED, _PASSED = 0.0, 1.0
+"""Alphas of what a photo does not show, when that cannot belong to the object and when it can."""
+_DEPTH_SAMPLES = 4096
+"""Points that stand for all where a median depth is asked for."""
 _FULL_COVERAGE = 0.98
 """Silhouettes that cover more than this of all pixels outline nothing."""
 _MAX_ROUNDS = 24
@@ -104,7 +107,7 @@ def _carved(
     voxel = float(size.prod()) ** (1 / 3) / side
     shape = [max(1, math.ceil(float(extent) / voxel)) for extent in size]
     grid = Grid(torch.ones(shape, dtype=torch.bool), low, voxel)
-    kept = in_hull(photos, grid.centers(grid.occupied), voxel * math.sqrt(3) / 2 if cautious else 0.0)
+    kept = in_hull(photos, grid.all_centers(), voxel * math.sqrt(3) / 2 if cautious else 0.0)
     return Grid(kept.view(shape), low, voxel)
 
 
@@ -115,49 +118,38 @@ def in_hull(photos: list[Thumbnail], points: Float[Tensor, "N 3"], radius: float
 
     With a `radius` (scene units) a point counts as solid, and as shown, when anything within it may be.
     """
-    alive, here = torch.arange(len(points)), points
-    shown = torch.zeros(len(points), dtype=torch.int32)
-    for photo in photos:
-        admitted, visible = admits(photo, here, radius)
-        rows = torch.nonzero(admitted)[:, 0]
-        alive, here = alive.index_select(0, rows), here.index_select(0, rows)
-        shown = shown.index_select(0, rows) + visible.index_select(0, rows)
-    kept = torch.zeros(len(points), dtype=torch.bool)
-    kept[alive] = 2 * shown >= len(photos)
-    return kept
+    pictures = [_picture(photo, radius, points) for photo in photos]
+    alpha, shown = lowest(pictures, points, beside=_PASSED, radius=radius, enough=_SOLID_ALPHA)
+    return (alpha > _SOLID_ALPHA) & (2 * shown >= len(photos))
 
 
-def admits(
-    photo: Thumbnail, points: Float[Tensor, "N 3"], radius: float = 0.0
-) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """True for points that one photo does not carve away, and true for those within its image."""
-    column, row, depth = project(photo.camera, points)
-    visible = inside(photo.camera, column, row, depth)
-    alpha = _widened(photo, radius, depth[visible]) if radius else photo.alpha()
-    passed = ~visible
-    if photo.shows_all():
-        passed &= _near(photo.camera, column, row, depth, radius)
-    column, row = (torch.where(visible, coordinate, 0.0) for coordinate in (column, row))  # no NaN to sample at
-    return (visible & (sample(alpha, column, row)[0] > _SOLID_ALPHA)) | passed, visible
+def admits(photo: Thumbnail, points: Float[Tensor, "N 3"], radius: float = 0.0) -> Bool[Tensor, "N"]:
+    """True for points that one photo does not carve away."""
+    return lowest([_picture(photo, radius, points)], points, beside=_PASSED, radius=radius)[0] > _SOLID_ALPHA
 
 
-def _near(camera: Cameras, column: Tensor, row: Tensor, depth: Tensor, radius: float) -> Bool[Tensor, "N"]:
-    """True when a ball of this radius around a point may reach into the image; never for a radius of 0."""
-    if radius == 0:
-        return torch.zeros(len(column), dtype=torch.bool)
-    reach = radius * float(camera.Ks[0].diagonal()[:2].max()) / (depth - radius).clamp_min(1e-12)
-    across = (column > -reach) & (column < camera.width + reach)
-    return (depth <= radius) | (across & (row > -reach) & (row < camera.height + reach))
+def _picture(photo: Thumbnail, radius: float, points: Float[Tensor, "N 3"]) -> Picture:
+    """The alpha of a photo, and of all that it does not show."""
+    return Picture(photo.camera, _widened(photo, radius, points)[0], _CARVED if photo.shows_all() else _PASSED)
 
 
-def _widened(photo: Thumbnail, radius: float, depths: Float[Tensor, "M"]) -> Float[Tensor, "1 H W"]:
-    """Alpha spread by what `radius` covers at the median depth, px."""
+def _widened(photo: Thumbnail, radius: float, points: Float[Tensor, "N 3"]) -> Float[Tensor, "1 H W"]:
+    """Alpha spread by what `radius` covers at the median depth of the points that the photo shows, px."""
     alpha = photo.alpha()
-    if len(depths) == 0:
+    if radius == 0:
         return alpha
-    reach = radius * float(photo.camera.Ks[0].diagonal()[:2].max()) / float(depths.median())
+    column, row, depth = project(photo.camera, points[:: math.ceil(len(points) / _DEPTH_SAMPLES) or 1])
+    depth = depth[inside(photo.camera, column, row, depth)]
+    if len(depth) == 0:
+        return alpha
+    reach = radius * float(photo.camera.Ks[0].diagonal()[:2].max()) / float(depth.median())
     pixels = min(math.ceil(reach), max(alpha.shape[1:]))
-    return _spread(_spread(alpha, pixels).mT, pixels).mT.contiguous()
+    return spread(alpha, pixels)
+
+
+def spread(planes: Float[Tensor, "1 H W"], reach: int) -> Float[Tensor, "1 H W"]:
+    """The largest value up to `reach` pixels away along both axes."""
+    return _spread(_spread(planes, reach).mT, reach).mT.contiguous()
 
 
 def _spread(planes: Float[Tensor, "1 H W"], reach: int) -> Float[Tensor, "1 H W"]:

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from gsopt.geometry.focus import Focus
 from gsopt.geometry.projection import inside, project
-from gsopt.init.hull import admits
+from gsopt.geometry.voxels import Grid
+from gsopt.init.hull import admits, spread
 from gsopt.init.thumbnails import Thumbnail
 
 MIN_MASKS = 3
@@ -93,7 +94,7 @@ class Agreement:
     def admits_mask(self, photo: Thumbnail) -> bool:
         """True when the agreeing silhouettes stay covered after this mask has carved the hull too."""
         hull = self.voxels.hull(self.agreeing)
-        kept = admits(photo, hull, self.voxels.reach)[0]
+        kept = admits(photo, hull, self.voxels.reach)
         return all(
             _covered_share(self.photos[row], hull[kept], self.voxels.size) >= MIN_COVERED for row in self.agreeing
         )
@@ -154,13 +155,12 @@ def shadow(photo: Thumbnail, points: Float[Tensor, "N 3"], size: float) -> Bool[
     camera = photo.camera
     column, row, depth = project(camera, points)
     seen = inside(camera, column, row, depth)
-    image = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    image = torch.zeros(1, camera.height, camera.width)
     if not bool(seen.any()):
-        return image
-    image[_pixel(row[seen], camera.height), _pixel(column[seen], camera.width)] = True
+        return image[0] > 0
+    image[0, _pixel(row[seen], camera.height), _pixel(column[seen], camera.width)] = 1
     reach = math.ceil(0.75 * size * float(camera.Ks[0].diagonal()[:2].max()) / float(depth[seen].median()))
-    wide = torch.nn.functional.max_pool2d(image[None, None].float(), 2 * reach + 1, 1, padding=reach)
-    return wide[0, 0] > 0
+    return spread(image, reach)[0] > 0
 
 
 def _pixel(coordinate: Float[Tensor, "N"], size: int) -> Int64[Tensor, "N"]:
@@ -185,8 +185,8 @@ def _around(photos: list[Thumbnail], centers: Float[Tensor, "M 3"], size: float)
 def _excluded(photos: list[Thumbnail], low: Float[Tensor, "3"], extent: Float[Tensor, "3"], side: int) -> Voxels:
     """About side³ voxels that fill a box."""
     size = float(extent.prod()) ** (1 / 3) / side
-    axes = [low[axis] + size * (torch.arange(math.ceil(float(extent[axis]) / size)) + 0.5) for axis in range(3)]
-    centers = torch.cartesian_prod(*axes)
+    shape = [math.ceil(float(length) / size) for length in extent]
+    centers = Grid(torch.ones(shape, dtype=torch.bool), low, size).all_centers()
     reach = size * math.sqrt(3) / 2
-    excluded = [~admits(photo, centers, reach)[0] for photo in photos]
+    excluded = [~admits(photo, centers, reach) for photo in photos]
     return Voxels(centers, size, torch.stack(excluded))

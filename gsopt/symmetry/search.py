@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid, dilated
 from gsopt.init.thumbnails import Thumbnail
+from gsopt.raster import _cpu  # type: ignore[attr-defined]
+from gsopt.raster.cpu_backend import workspace
 from gsopt.symmetry.axis import Axis, perpendicular
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import RayPoints, Silhouettes
@@ -38,8 +40,6 @@ LEAST_GAIN, LEAST_STEP = 0.995, 3e-4
 """It ends when a step leaves more than this share of the misses, or moves by less: radians, radii."""
 GIVE_UP_AT, GIVE_UP_ABOVE = 4, 3.0
 """It is abandoned when this many steps leave more than so many times the accepted misses."""
-_CHUNK = 128
-"""Planes whose voxels are looked up at once: bounds memory."""
 M = TypeVar("M", Mirror, Axis)
 
 
@@ -112,52 +112,29 @@ def uncovered(
 ) -> Float[Tensor, "P"]:
     """For every plane the share of the silhouettes (in pixels a voxel wide, mean over the photos) that no voxel covers
     whose mirror image also lies in the hull, give or take one voxel."""
+    cells = torch.nonzero(grid.occupied).float() + 0.5
+    offsets = (offsets - (normals * grid.low).sum(1)) / grid.voxel
     centers = grid.centers()
-    wide = torch.nn.functional.pad(dilated(grid.occupied), (1,) * 6)
     pixels = [_pixels(photo, centers, grid.voxel) for photo in photos]
-    lost = []
-    for n, d in zip(normals.split(_CHUNK), offsets.split(_CHUNK), strict=True):
-        stays = _also_behind(wide, grid, centers, n, d)
-        shares = [_uncovered_share(rows, pixel, stays) for rows, pixel in pixels]
-        lost.append(torch.stack(shares).mean(0))
-    return torch.cat(lost)
-
-
-def _also_behind(
-    wide: Bool[Tensor, "X Y Z"], grid: Grid, centers: Float[Tensor, "M 3"], normals: Tensor, offsets: Tensor
-) -> Bool[Tensor, "M P"]:
-    """True when the mirror image of a voxel's center lies in `wide`, which is padded by one voxel."""
-    beyond = sum(centers[:, axis, None] * normals[:, axis] for axis in range(3)) - offsets
-    inside_grid = torch.ones_like(beyond, dtype=torch.bool)
-    index = torch.zeros_like(beyond, dtype=torch.int32)
-    for axis, size in enumerate(wide.shape):
-        there = (centers[:, axis, None] - 2 * beyond * normals[:, axis] - grid.low[axis]) / grid.voxel
-        cell = there.floor().int() + 1
-        inside_grid &= (cell >= 0) & (cell < size)
-        index = index * size + cell.clamp(0, size - 1)
-    return wide.flatten()[index] & inside_grid
+    lost = torch.empty(len(normals))
+    wide = dilated(grid.occupied).view(torch.uint8)
+    _cpu.mirror(workspace(1), cells, normals.contiguous(), offsets, wide, pixels, lost)
+    return lost
 
 
 def _pixels(
     photo: Thumbnail, centers: Float[Tensor, "M 3"], voxel: float
-) -> tuple[Int64[Tensor, "K"], Int64[Tensor, "K"]]:
-    """Rows of the centers that the photo shows, and the pixel of each, counted from 0 without gaps."""
+) -> tuple[Int32[Tensor, "K"], Int32[Tensor, "K"], int]:
+    """Rows of the centers that the photo shows, the pixel of each, counted from 0 without gaps, and their number."""
     column, row, depth = project(photo.camera, centers)
     shown = torch.nonzero(inside(photo.camera, column, row, depth))[:, 0]
     if len(shown) == 0:
-        return shown, shown
+        return shown.int(), shown.int(), 0
     step = max(1.0, voxel * float(photo.camera.Ks[0, 0, 0]) / float(depth[shown].median()))
     width = math.ceil(photo.camera.width / step) + 1
     pixel = (row[shown] / step).long() * width + (column[shown] / step).long()
-    return shown, torch.unique(pixel, return_inverse=True)[1]
-
-
-def _uncovered_share(rows: Tensor, pixel: Tensor, stays: Bool[Tensor, "M P"]) -> Float[Tensor, "P"]:
-    if len(rows) == 0:
-        return torch.zeros(stays.shape[1])
-    covered = torch.zeros(int(pixel.max()) + 1, stays.shape[1])
-    covered.scatter_reduce_(0, pixel[:, None].expand(-1, stays.shape[1]), stays[rows].float(), "amax")
-    return 1 - covered.mean(0)
+    occupied, place = torch.unique(pixel, return_inverse=True)
+    return shown.int(), place.int(), len(occupied)
 
 
 def refined(mirror: M, silhouettes: Silhouettes, ball: Ball, wanted: float) -> tuple[M, float]:

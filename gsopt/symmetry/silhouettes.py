@@ -13,9 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
+from gsopt.data.lookup import lowest
 from gsopt.data.outlines import MAX_DISTANCE, Outline
 from gsopt.init.thumbnails import Thumbnail
 from gsopt.symmetry.axis import Axis
@@ -48,9 +49,10 @@ class Silhouettes:
         self.outlines = [Outline.of(photo.camera, photo.alpha()) for photo in photos]
         rays = [_rays(outline, center, radius) for outline in self.outlines]
         self._origins, self._directions, self._depths = (torch.cat(parts) for parts in zip(*rays, strict=True))
-        self._own = torch.cat([torch.full((len(origins),), row) for row, (origins, _, _) in enumerate(rays)])
+        self._counts = [len(origins) for origins, _, _ in rays]
+        self._pictures = [outline.picture for outline in self.outlines]
         points = self._points(self._depths)
-        others = self._among_others(points, self._own[:, None])
+        others = self._among_others(points)
         self._kept = others > -EXCLUSION_SLACK
         self._kept_points, self._kept_others = points[self._kept], others[self._kept]
 
@@ -66,7 +68,7 @@ class Silhouettes:
         # The best point lies between two samples.
         depth = self._depths.gather(1, smallest.argmax(1, keepdim=True))
         points = self._points(depth + torch.linspace(-1, 1, FINER) * (self._depths[:, 1:2] - self._depths[:, :1]))
-        return RayPoints(points, self._among_others(points, self._own[:, None]))
+        return RayPoints(points, self._among_others(points))
 
     def misses(self, mirror: Mirror | Axis, near: RayPoints) -> Float[Tensor, "R"]:
         """(1) for the rays of all photos, px, at most MAX_MISS; x is sought among points near the optima of this mirror
@@ -76,20 +78,18 @@ class Silhouettes:
     def _points(self, depths: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
         return self._origins[:, None] + self._directions[:, None] * depths[..., None]
 
-    def _among_others(self, points: Float[Tensor, "R S 3"], own: Int64[Tensor, "R 1"]) -> Float[Tensor, "R S"]:
+    def _among_others(self, points: Float[Tensor, "R S 3"]) -> Float[Tensor, "R S"]:
         """The smallest signed distance in all photos but the ray's own."""
-        smallest = torch.full(points.shape[:-1], float(MAX_DISTANCE))
-        for index, outline in enumerate(self.outlines):
-            smallest = torch.where(own == index, smallest, torch.minimum(smallest, outline.at(points)))
-        return smallest
+        if len(self._pictures) == 1:
+            return torch.full(points.shape[:-1], float(MAX_DISTANCE))
+        rest = (self._pictures[:own] + self._pictures[own + 1 :] for own in range(len(self._pictures)))
+        rays = points.split(self._counts)
+        return torch.cat([lowest(others, own)[0] for others, own in zip(rest, rays, strict=True)])
 
     def _behind(self, mirror: Mirror | Axis, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
         """The smallest signed distance of the points' images in all photos."""
-        smallest = torch.full(points.shape[:-1], float(MAX_DISTANCE))
-        for image in mirror.images(points):
-            for outline in self.outlines:
-                smallest = torch.minimum(smallest, outline.at(image))
-        return smallest
+        images = torch.stack(list(mirror.images(points)))
+        return lowest(self._pictures, images)[0].amin(0)
 
 
 def _rays(

@@ -133,7 +133,7 @@ def test_an_object_thinner_than_a_voxel_is_found(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(hull, "_carved", watched)
     monkeypatch.setattr(hull, "_MAX_SIDE", 14)  # fine voxels of 0.05
-    root = ellipsoid_scene(tmp_path, spread_cameras(4, size=256), (0.0, 0.0, 0.0), (1.0, 0.02, 0.02))
+    root = ellipsoid_scene(tmp_path, spread_cameras(4, size=256), (0.0, 0.0, 0.0), (1.0, 0.015, 0.015))
     gaussians, _ = first_gaussians(load_scene(root), InitConfig(method="hull", count=500), 0, 0)
     assert empty == [(True, False), (False, True), (True, False)]  # the box, no voxel's center, any part of a voxel
     assert float(gaussians.means[:, 0].amax()) > 0.9

@@ -9,7 +9,7 @@ import torch
 
 from gsopt.geometry.cameras import Cameras, look_at
 from gsopt.init.guessed_views import voxel_gaussians
-from gsopt.init.hull import _near, _spread, _widened
+from gsopt.init.hull import _spread, _widened, admits, in_hull
 from gsopt.init.inflation import object_box, plane_normal
 from gsopt.init.thumbnails import Thumbnail
 
@@ -30,24 +30,34 @@ def test_a_silhouette_widens_by_what_a_radius_covers_at_the_median_depth(radius:
     """At a depth of ten a tenth of a unit is a pixel."""
     planes = torch.zeros(4, SIDE, SIDE, dtype=torch.uint8)
     planes[3, 20, 10] = 255
-    found = _widened(Thumbnail(CAMERA, planes), radius, torch.tensor([10.0, 10.0, 99.0]))[0]
+    found = _widened(Thumbnail(CAMERA, planes), radius, torch.tensor([[0.0, 0, 10], [1, 0, 10], [0, 1, 99]]))[0]
     rows, columns = (found > 0.5).nonzero().unbind(1)
     assert (int(rows.min()), int(rows.max())) == (20 - pixels, 20 + pixels)
     assert (int(columns.min()), int(columns.max())) == (10 - pixels, 10 + pixels)
     assert len(rows) == (2 * pixels + 1) ** 2
 
 
-def test_a_ball_reaches_into_the_image_by_its_radius_in_pixels() -> None:
-    """A radius of one at a depth of eleven, whose near side is ten away, reaches ten pixels beyond each border."""
-    depth = torch.full((4,), 11.0)
-    places = torch.tensor([-9.9, -10.1, SIDE + 9.9, SIDE + 10.1])
-    middle = torch.full((4,), 20.0)
-    expected = [True, False, True, False]
-    assert _near(CAMERA, places, middle, depth, 1.0).tolist() == expected
-    assert _near(CAMERA, middle, places, depth, 1.0).tolist() == expected
-    assert not bool(_near(CAMERA, middle, middle, depth, 0.0).any())
-    far = torch.full((2,), 1e6)
-    assert _near(CAMERA, far, far, torch.tensor([1.0, -3.0]), 1.0).tolist() == [True, True]
+def test_a_photo_of_the_whole_object_keeps_balls_that_may_reach_into_it() -> None:
+    """A radius of one at a depth of eleven, whose near side is ten away, reaches ten pixels beyond the border."""
+    planes = torch.zeros(4, SIDE, SIDE, dtype=torch.uint8)
+    planes[3, 10:30, 10:30] = 255
+    across = torch.tensor([-2.9, -3.1, 2.9, 3.1])
+    points = torch.stack([1.1 * across, torch.zeros(4), torch.full((4,), 11.0)], dim=1)
+    around = torch.tensor([[900.0, 0, 1], [0, 0, -3]])
+    for places in (points, points[:, [1, 0, 2]]):
+        admitted = admits(Thumbnail(CAMERA, planes), torch.cat([places, around]), 1.0)
+        assert admitted.tolist() == [True, False] * 2 + [True, True]
+        assert not bool(admits(Thumbnail(CAMERA, planes), places).any())
+
+
+@pytest.mark.parametrize("radius", [0.0, 1.0])
+def test_a_photo_of_a_part_of_the_object_carves_nothing_beside_the_image(radius: float) -> None:
+    planes = torch.zeros(4, SIDE, SIDE, dtype=torch.uint8)
+    planes[3, 10:30, 30:] = 255
+    beside = torch.tensor([[-3.1, 0.0, 11.0], [-2.0, 0.0, 11.0]])
+    photo = Thumbnail(CAMERA, planes)
+    assert admits(photo, beside, radius).tolist() == [True, False]
+    assert not bool(in_hull([photo], beside, radius).any()), "half of the photos must show a point"
 
 
 def test_the_box_of_an_object_lies_at_the_focus_around_its_pixels() -> None:

@@ -18,6 +18,7 @@ from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.geometry.projection import inside, project
 from gsopt.geometry.voxels import Grid
 from gsopt.init.thumbnails import Thumbnail
+from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.symmetry import colors, find, search, silhouettes, upright
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.search import Ball, bounding_ball, half_circle, half_sphere, joined, refined, same, uncovered
@@ -104,12 +105,17 @@ def share_by_hand(grid: Grid, shown: Thumbnail, normal: Tensor, offset: float) -
     return 1 - sum(pixels.values()) / len(pixels)
 
 
+@pytest.mark.parametrize("isa", _cpu.instruction_sets())
 @pytest.mark.parametrize("offset", [-0.35, 0.02, 0.31])
-def test_what_a_plane_leaves_unexplained_is_counted_pixel_by_pixel(offset: float) -> None:
+def test_what_a_plane_leaves_unexplained_is_counted_pixel_by_pixel(
+    offset: float, isa: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There are more planes than bits in a word of the kernel."""
+    monkeypatch.setenv("GSOPT_ISA", isa)
     grid = Grid(blocks(3).occupied & (torch.arange(6) < 4), blocks().low, 0.2)
     photos = [photo(20), photo(140)]
-    normals = torch.nn.functional.normalize(torch.tensor([[1.0, 0.2, 0.1], [0.1, 1.0, -0.4], [0.2, -0.3, 1.0]]), dim=1)
-    found = uncovered(grid, photos, normals, torch.full((3,), offset))
+    normals = half_sphere(66)
+    found = uncovered(grid, photos, normals, torch.full((66,), offset))
     expected = [sum(share_by_hand(grid, one, normal, offset) for one in photos) / 2 for normal in normals]
     assert found.tolist() == pytest.approx(expected, abs=1e-6)
     assert max(expected) > 0

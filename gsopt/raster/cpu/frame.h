@@ -170,6 +170,42 @@ struct DistanceArguments {
   Buffer* slab;
 };
 
+// The lowest value that several pictures have at points (cpu/lookup.h).
+struct Picture {
+  float R[9], t[3];  // cam_from_world
+  float fx, fy, cx, cy, columns, rows;
+  const float* image;  // [height, width]: the camera's columns and rows at any resolution
+  int width, height;
+  float unseen;  // value of a point that is not shown
+};
+struct LookupArguments {
+  int64_t count;
+  const float* points;  // [count, 3]
+  const Picture* pictures;
+  int picture_count;
+  bool beside_is_border;  // points before the camera and beside the image have the border's value
+  float radius, beside;   // else, within this distance (scene units) of what the camera sees, they have this one
+  float enough;           // no more pictures are looked at for points with a value as low
+  float* values;          // [count]
+  int32_t* shown;         // [count]: by how many of the pictures that were looked at
+};
+
+// Mirror planes of a grid, in units of its voxels (cpu/mirror.h).
+struct MirrorPhoto {
+  int64_t count, pixels;
+  const int32_t *rows, *pixel;  // [count]: voxels that it shows, and where
+};
+struct MirrorArguments {
+  int64_t count, planes;
+  const float *centers, *normals, *offsets;  // [count, 3], [planes, 3] and [planes]
+  const uint8_t* cells;                      // of `shape`: where a mirror image may lie
+  int shape[3];
+  const MirrorPhoto* photos;
+  int photo_count;
+  float* lost;  // [planes]
+  Buffer* words;
+};
+
 // What one core can do at best, lanes per second: fused multiply-adds, and exponentials.
 struct Calibration {
   double fma, exp;
@@ -187,6 +223,8 @@ struct Kernels {
   void (*adam)(Pool&, const AdamArguments&);
   void (*match)(Pool&, const MatchArguments&);
   void (*distance)(const DistanceArguments&);
+  void (*lookup)(const LookupArguments&);
+  void (*mirror)(Pool&, const MirrorArguments&);
   Calibration (*calibrate)();
 };
 

@@ -9,7 +9,9 @@
 #include "blend_backward.h"
 #include "calibrate.h"
 #include "distance.h"
+#include "lookup.h"
 #include "match.h"
+#include "mirror.h"
 #include "photometric.h"
 #include "project_backward.h"
 
@@ -30,6 +32,8 @@ const Kernels kernels = {
     adam_stage,
     match_stage,
     distance_stage,
+    lookup_stage,
+    mirror_stage,
     calibrate,
 };
 

@@ -1,6 +1,4 @@
 // The Python side of the CPU kernels: arrays in and out by DLPack, no torch, the GIL released while kernels run.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
@@ -10,23 +8,17 @@
 
 #include <algorithm>
 #include <array>
-#include <chrono>
 #include <cmath>
 #include <cstdlib>
-#include <ctime>
-#include <map>
-#include <memory>
-#include <stdexcept>
+#include <optional>
 #include <string>
 #include <tuple>
 #include <vector>
 
-#include "frame.h"
+#include "workspace.h"
 #if defined(GSOPT_HAVE_AVX2)
 #include "processor.h"
 #endif
-
-namespace nb = nanobind;
 
 namespace gsopt {
 
@@ -41,30 +33,29 @@ namespace portable { extern const Kernels kernels; }
 
 namespace {
 
-using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using InByte = nb::ndarray<const uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-using OutShort = nb::ndarray<int16_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-using OutInt = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
-
-// Those this processor can run, best first.
-std::vector<const Kernels*> available_kernels() {
-  std::vector<const Kernels*> found;
+// Those this processor can run, best first; asked once, since under a hypervisor the question takes 0.1 ms.
+const std::vector<const Kernels*>& available_kernels() {
+  static const auto kernels = [] {
+    std::vector<const Kernels*> found;
 #if defined(GSOPT_HAVE_AVX512)
-  if (has_avx512()) found.push_back(&avx512::kernels);
+    if (has_avx512()) found.push_back(&avx512::kernels);
 #endif
 #if defined(GSOPT_HAVE_AVX2)
-  if (has_avx2()) {
-    found.push_back(&avx2::kernels);
-    found.push_back(&avx2x2::kernels);
-  }
+    if (has_avx2()) {
+      found.push_back(&avx2::kernels);
+      found.push_back(&avx2x2::kernels);
+    }
 #endif
-  found.push_back(&portable::kernels);
-  return found;
+    found.push_back(&portable::kernels);
+    return found;
+  }();
+  return kernels;
 }
 
+}  // namespace
+
 const Kernels* choose_kernels(const std::string& name) {
-  const auto found = available_kernels();
+  const auto& found = available_kernels();
   if (name.empty()) return found.front();
   std::string names;
   for (const Kernels* k : found) {
@@ -74,31 +65,7 @@ const Kernels* choose_kernels(const std::string& name) {
   throw std::invalid_argument("instruction set `" + name + "` is not available here. Choose one of: " + names);
 }
 
-struct Workspace {
-  Pool pool;
-  const Kernels* kernels;
-  Buffer scratch;
-  int64_t max_entries = UINT32_MAX;  // (splat, tile) pairs of one frame
-  bool count_work = false;
-  Skips skips;
-  Work work;                                  // summed over frames while count_work is set
-  std::map<std::string, double> seconds;      // wall time per stage since construction
-  std::map<std::string, double> cpu_seconds;  // the same in CPU time of the whole process
-  Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) {}
-};
-
-template <class Stage> void timed(Workspace& ws, const char* name, Stage&& stage) {
-  const auto start = std::chrono::steady_clock::now();
-  const std::clock_t cpu_start = std::clock();
-  stage();
-  ws.seconds[name] += std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-  ws.cpu_seconds[name] += static_cast<double>(std::clock() - cpu_start) / CLOCKS_PER_SEC;
-}
-
-template <class Array> auto* data_of(const Array& a, size_t size, const char* name) {
-  if (a.size() != size) throw std::invalid_argument(std::string(name) + ": wrong number of elements");
-  return a.data();
-}
+namespace {
 
 struct Model {
   Out means, quats, log_scales, logit_opacities, sh0, shN;
@@ -272,37 +239,6 @@ void adam(Workspace& ws, Model& model, Gradient& g, Model& exp_avg, Model& exp_a
   timed(ws, "adam", [&] { ws.kernels->adam(ws.pool, a); });
 }
 
-// What stays the same while planes are tried for the pixels of one picture.
-struct Windows {
-  In offsets, rays, windows, inverse_deviation;
-  float step_x, step_y, least_variance, unseen;
-};
-
-// A: 9 and T: 3 floats; costs and each third of `planes` have one element per ray.
-void match(Workspace& ws, const Windows& w, In corners, int height, int width, const std::vector<float>& A,
-    const std::vector<float>& T, In planes, Out costs) {
-  const size_t padded = costs.size(), taps = w.offsets.size() / 2;
-  if (A.size() != 9 || T.size() != 3 || padded % 8 || width < 2 || height < 2)
-    throw std::invalid_argument("match: wrong number of elements");
-  MatchArguments a = {static_cast<int64_t>(padded), static_cast<int>(taps), w.offsets.data(),
-      data_of(w.rays, 2 * padded, "rays"), data_of(w.windows, 2 * taps * padded, "windows"),
-      data_of(w.inverse_deviation, padded, "inverse_deviation"), data_of(planes, 3 * padded, "planes"),
-      data_of(corners, 4 * static_cast<size_t>(height) * width, "corners"), width, height, {}, {}, w.step_x, w.step_y,
-      w.least_variance, w.unseen, costs.data()};
-  std::copy(A.begin(), A.end(), a.A);
-  std::copy(T.begin(), T.end(), a.T);
-  nb::gil_scoped_release release;
-  timed(ws, "match", [&] { ws.kernels->match(ws.pool, a); });
-}
-
-void squared_distance(Workspace& ws, InByte cells, int reach, OutShort squared) {
-  DistanceArguments a = {cells.data(), {}, reach, data_of(squared, cells.size(), "squared"), &ws.scratch};
-  for (int axis = 0; axis < 3; ++axis) a.shape[axis] = static_cast<int>(cells.shape(axis));
-  if (reach < 0 || reach * reach > kFarSquared) throw std::invalid_argument("squared_distance: reach out of range");
-  nb::gil_scoped_release release;
-  timed(ws, "distance", [&] { ws.kernels->distance(a); });
-}
-
 }  // namespace
 
 NB_MODULE(_cpu, m) {
@@ -360,9 +296,7 @@ NB_MODULE(_cpu, m) {
   m.def("photometric", &photometric);
   m.def("adam", &adam, nb::arg(), nb::arg(), nb::arg(), nb::kw_only(), nb::arg("exp_avg"), nb::arg("exp_avg_sq"),
       nb::arg("step"), nb::arg("camera"), nb::arg("sh_degree"));
-  nb::class_<Windows>(m, "Windows").def(nb::init<In, In, In, In, float, float, float, float>());
-  m.def("match", &match);
-  m.def("squared_distance", &squared_distance, nb::arg(), nb::arg(), nb::arg(), out);
+  define_preparation(m);
 }
 
 }  // namespace gsopt
