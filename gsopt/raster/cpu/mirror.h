@@ -1,8 +1,6 @@
 // What mirror planes leave unexplained of silhouettes (gsopt/symmetry/search.py), 64 planes at a time: one bit each in
 // a word per voxel, and in a word per pixel of a silhouette.
 #pragma once
-#include <cmath>
-
 #include "frame.h"
 #include "parallel.h"
 #include "simd.h"
