@@ -185,12 +185,12 @@ def test_voxels_are_drawn_in_the_photos_colors_or_in_their_own_where_no_photo_sh
     own: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Straight color and alpha on black, rounded to bytes; a splat is 0.6 of a voxel."""
-    grid = Grid(torch.ones(1, 1, 2, dtype=torch.bool), torch.zeros(3), 0.5)
+    grid = Grid(torch.ones(1, 1, 2, dtype=torch.bool), torch.tensor([1.0, 2, 3]), 0.5)
     monkeypatch.setattr(guessed_views, "without_rim", lambda photo: photo)
     monkeypatch.setattr(
         guessed_views, "unoccluded_colors", lambda grid, photos, points: torch.full((len(points), 3), 0.25)
     )
-    monkeypatch.setattr(guessed_views, "seen_colors", lambda grid, photos, points: (None, points[:, 2] < 0.5))
+    monkeypatch.setattr(guessed_views, "seen_colors", lambda grid, photos, points: (None, points[:, 2] < 3.5))
     drawn: list[Any] = []
 
     def forward(gaussians: Any, camera: Any, settings: Any, background: Any) -> Any:
@@ -204,7 +204,7 @@ def test_voxels_are_drawn_in_the_photos_colors_or_in_their_own_where_no_photo_sh
     assert images.shape == (2, 2, 3, 4)
     assert {tuple(pixel) for pixel in images.view(-1, 4).tolist()} == {(153, 153, 153, 128)}
     assert torch.equal(DrawnImages(images).get(1), images[1])
-    order = drawn[0].means[:, 2] > 0.5
+    order = drawn[0].means[:, 2] > 3.5
     rgb = rgb_from_sh0(drawn[0].sh0[:, 0])[:, 0]
     assert rgb[~order].tolist() == pytest.approx([0.25] * int((~order).sum()), abs=1e-5)
     assert rgb[order].tolist() == pytest.approx([0.75 if own else 0.25] * int(order.sum()), abs=1e-5)
