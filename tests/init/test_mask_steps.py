@@ -283,3 +283,53 @@ def test_a_box_of_points_holds_those_that_the_camera_sees() -> None:
     assert box_of_points(camera, points[2:]) is None
     wide = torch.tensor([[-1.0, -0.8, 1.0], [0.99, 0.79, 1.0]])
     assert box_of_points(camera, wide) == (0, 0, 100, 80)
+
+
+def test_a_network_sees_colors_alone_and_masks_of_one_folder_lie_together(tmp_path: Path) -> None:
+    Image.new("RGBA", (300, 200), (90, 80, 70, 9)).save(tmp_path / "a.png")
+    one = MaskedPhoto("a", tmp_path / "a.png", tmp_path / "masks" / "sub" / "a.png")
+    assert steps._colors(one).shape == (200, 300, 3)
+    assert set(np.unique(steps._colors(one))) == {90, 80, 70}
+    steps._write(one, np.zeros((2, 2), np.float32))
+    steps._write(replace(one, mask=one.mask.with_name("b.png")), np.zeros((2, 2), np.float32))
+    assert len(list(one.mask.parent.iterdir())) == 2
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_photos_whose_masks_disagree_are_looked_at_where_the_others_show_the_object(
+    tmp_path: Path, many: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three input views the second disagrees; held-out views are looked at too, a view without a box is not. Of 33
+    views 32 are checked, those farthest apart."""
+    count = 33 if many else 3
+    camera = SimpleNamespace(centers=torch.zeros(1, 3))
+    train = [SimpleNamespace(name=f"t{i}", camera=camera) for i in range(count)]
+    scene = SimpleNamespace(train=train, test=[SimpleNamespace(name="h0", camera=camera)], extent=1.0)
+    asked: list[Any] = []
+    monkeypatch.setattr(steps, "load_scene", lambda config: (asked.append(config), scene)[1])
+    monkeypatch.setattr(steps, "farthest_points", lambda centers, most: range(count - 1, count - 1 - most, -1))
+    monkeypatch.setattr(steps, "small_photos", lambda views, most: list(views))
+    monkeypatch.setattr(steps, "find_focus", lambda cameras, extent: "focus")
+    found: Any = SimpleNamespace(agreeing=[0, 2], disagreeing=[1])
+    monkeypatch.setattr(
+        steps, "mask_agreement", lambda photos, focus: (asked.append([p.name for p in photos]), found)[1]
+    )
+    monkeypatch.setattr(
+        steps, "object_points", lambda photos, focus: (asked.append([p.name for p in photos]), torch.zeros(1, 3))[1]
+    )
+    left = iter([(1, 2, 3, 4), None, *[(5, 6, 7, 8)] * count])
+    monkeypatch.setattr(steps, "box_of_points", lambda camera, points: next(left))
+    disagreeing, boxes = steps._agreed(DataConfig(path="scene", downscale=4, cache_mb=99, depth="d"), tmp_path) or (
+        [],
+        {},
+    )
+    config, checked, agreeing = asked
+    assert (config.masks, config.downscale, config.depth, config.cache_mb) == (str(tmp_path / "masks"), 1, None, 0)
+    first = 1 if many else 0
+    assert checked == [f"t{i}" for i in range(first, count)]
+    assert agreeing == [f"t{first}", f"t{first + 2}"]
+    assert disagreeing == [f"t{first + 1}"]
+    expected = {f"t{i}" for i in range(count)} - {f"t{first}", f"t{first + 2}", "t1"} | {"h0"}
+    assert set(boxes) == (expected | {"t0"} if many else {"h0"})
+    monkeypatch.setattr(steps, "mask_agreement", lambda photos, focus: None)
+    assert steps._agreed(DataConfig(path="scene"), tmp_path) is None
