@@ -59,5 +59,5 @@ def made_from(scene: Path, data: Path, config: SfmConfig) -> bool:
         if not same or found["fingerprint"] != fingerprint(data):
             return False
         return bool(found.get("mask_fingerprint", []) == mask_fingerprint(config.masks, data))
-    except (InputError, KeyError, TypeError, json.JSONDecodeError):
+    except (InputError, AttributeError, KeyError, TypeError, json.JSONDecodeError):
         return False
