@@ -30,7 +30,7 @@ LEAST_SHARE = 0.01
 def require_library(config: GuidanceConfig) -> None:
     """Raises InputError for a shape library that cannot be read: before any work."""
     named = library_of(config.prior)
-    if named is not None and not Path(named).is_dir():
+    if named is not None and not (named and Path(named).is_dir()):
         ShapeLibrary(Path(named) if named else BUNDLED)
 
 

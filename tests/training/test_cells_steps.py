@@ -287,3 +287,52 @@ def test_a_run_in_cells_is_coarse_then_cells_then_polished(
     assert (tmp_path / "splat.ply").is_file() != stopped
     last = json.loads((tmp_path / "events.jsonl").read_text().splitlines()[-1]) if stopped else {}
     assert not stopped or (last["kind"], last["step"], last["seconds"]) == ("stopped", 41, 1.235)
+
+
+def test_cells_that_do_not_go_together_with_a_setting_are_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "open_farm", None)
+    with pytest.raises(UsageError, match="--refine-poses"):
+        driver.train_in_cells(replace(TrainConfig(), poses=PoseConfig(refine=True)), tmp_path / "run", "local")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_plan_is_made_once_after_the_splats_that_its_runs_begin_with(
+    scene: Scene, directory: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each cell begins with its part of the coarse model, margin included, beside what its views see outside."""
+    coarse = cloud(30, 1)
+    (directory.path / "coarse").mkdir()
+    save_ply(directory.path / "coarse" / "splat.ply", coarse)
+    inf = float("inf")
+    names = tuple(view.name for view in scene.train)
+    cells = (
+        Cell("00", (-inf, -inf), (0.0, inf), (0.1, 0.1), names[:2], 9),
+        Cell("01", (0.0, -inf), (inf, inf), (0.1, 0.1), names[1:], 9),
+    )
+    outside = (torch.arange(30) < 3, torch.arange(30) < 5)
+    asked: list[Any] = []
+
+    def divide(splats: Any, sha: str, views: Any, backend: Any, count: int, most: int) -> Any:
+        asked.append((len(splats), len(views), count, most))
+        plan = CellPlan(sha, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), cells)
+        return SimpleNamespace(plan=plan, surroundings=outside)
+
+    monkeypatch.setattr(driver, "divide", divide)
+    config = tiny_config(Path("unused"), cells="2")
+    for _ in range(2):
+        found = driver._plan(config, scene, directory, 2, 77)
+        assert found.cells == cells
+    assert asked == [(30, len(names), 2, 77)]
+    for cell, frozen, wide in zip(cells, outside, (coarse.means[:, 0] < 0.1, coarse.means[:, 0] >= -0.1), strict=True):
+        folder = directory.path / "cells" / cell.name
+        torch.testing.assert_close(driver.load_splats(folder / "start.ply").means, coarse.means[wide])
+        torch.testing.assert_close(driver.load_splats(folder / "frozen.ply").means, coarse.means[frozen])
+
+
+def test_a_run_that_ended_before_its_first_cell_has_no_gaussians() -> None:
+    none = driver._none()
+    assert len(none) == 0
+    assert none.validate().sh_degree == 0
+    assert len(none.append(replace(cloud(3, 1), shN=torch.zeros(3, 0, 3)))) == 3

@@ -319,6 +319,8 @@ def test_a_single_photo_or_one_who_asks_gets_a_body_and_what_has_no_mirrors_gets
     def ends(*_: object) -> bool:
         raise Ended
 
+    read: list[Any] = []
+    monkeypatch.setattr(loop, "require_readable", read.append)
     monkeypatch.setattr(loop, "load_with_agreeing_masks", lambda data: (scene, []))
     monkeypatch.setattr(loop, "with_recorded_mirrors", lambda config, scene, directory: scene)
     monkeypatch.setattr(loop, "_with_prior_body", lambda config, scene, *_: (done.append("body"), scene)[1])
@@ -327,3 +329,4 @@ def test_a_single_photo_or_one_who_asks_gets_a_body_and_what_has_no_mirrors_gets
     with pytest.raises(Ended):
         loop.train(tiny_config(dataset, guidance=guidance), tmp_path / "run")
     assert done == parts
+    assert read == [scene.test], "held-out images are read before anything that takes time"
