@@ -18,7 +18,7 @@ from gsopt.config.cells import CellConfig
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import SparseConfig
 from gsopt.data.scene import Scene, load_scene
-from gsopt.errors import InputError
+from gsopt.errors import InputError, NumericalError
 from gsopt.formats import load_splats
 from gsopt.formats.ply import save_ply
 from gsopt.raster.api import make_backend
@@ -197,7 +197,7 @@ def test_a_preview_is_on_the_disk_before_it_is_told(scene: Scene, tmp_path: Path
         assert seen == [("previews/step_000012.ply", len(trainer.model))]
         trainer.model.gaussians.means[0, 0] = math.nan
         for write in (loop._preview, lambda *args: loop._save(*args, loop.Clock(0, 0.0, 0.0))):
-            with pytest.raises(Exception, match="nan"):
+            with pytest.raises(NumericalError, match="`means` became nan"):
                 write(trainer, directory)
     assert len(seen) == 1
 
