@@ -78,6 +78,7 @@ def test_the_guard_decides_once_and_its_word_stands_in_the_record(
     recorded: dict[str, Any] = {"prior": "p", "lambda_sds": 0.5, "reason": "asked"}
     if resumed:
         recorded["guard"] = {"factor": 0.5, "reason": "why", "trials": []}
+        (tmp_path / "run" / "guidance").mkdir(parents=True)
     directory, checked = Directory(tmp_path / "run"), list[Any]()
     monkeypatch.setattr(start, "recorded_choice", lambda plan, directory: recorded)
     monkeypatch.setattr(start, "_opened", lambda config, scene, recorded, directory: Setup(0.5))
