@@ -80,9 +80,9 @@ def test_the_covered_share_is_that_of_a_silhouettes_own_pixels() -> None:
 def test_voxels_fill_a_box_and_know_who_excludes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     low, extent, asked = torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 2, 1]), list[float]()
 
-    def admits(photo: Any, centers: torch.Tensor, reach: float) -> tuple[torch.Tensor, None]:
+    def admits(photo: Any, centers: torch.Tensor, reach: float) -> torch.Tensor:
         asked.append(reach)
-        return centers[:, photo] > 2, None
+        return centers[:, photo] > 2
 
     monkeypatch.setattr(steps, "admits", admits)
     photos: Any = [0, 1]

@@ -304,10 +304,13 @@ def test_points_fill_their_cells_evenly_and_only_those_in_the_hull_stay(monkeypa
 def test_a_point_of_the_hull_is_shown_by_half_of_the_photos_and_carved_by_none(
     shown: list[int], admitted: list[int], kept: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def admits(photo: int, points: Any, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.tensor([bool(admitted[photo])] * len(points)), torch.tensor([bool(shown[photo])] * len(points))
+    def lowest(photos: list[int], points: Any, **more: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """The alphas that the photos have at every point, and how many show it."""
+        alpha = min(float(admitted[photo]) for photo in photos)
+        return torch.full((len(points),), alpha), torch.full((len(points),), sum(shown[photo] for photo in photos))
 
-    monkeypatch.setattr(hull, "admits", admits)
+    monkeypatch.setattr(hull, "_picture", lambda photo, radius, points: photo)
+    monkeypatch.setattr(hull, "lowest", lowest)
     assert hull.in_hull([0, 1, 2, 3], torch.zeros(2, 3)).tolist() == [kept, kept]  # type: ignore[list-item]
 
 
