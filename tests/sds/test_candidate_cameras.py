@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -45,6 +46,27 @@ def test_a_camera_is_placed_by_azimuth_from_the_front_and_elevation() -> None:
     assert found.focus.norm() < 2e-2
     assert found.candidates.centers[12:24, 2].tolist() == pytest.approx([4 * math.sin(20 * DEGREES)] * 12, abs=2e-2)
     assert (found.candidates[0].Ks[0] - found.K).abs().max() < 1e-6
+
+
+def test_everything_moves_with_the_subject() -> None:
+    """What is told of cameras far from the origin is what is told of the same ones around it."""
+    by = torch.tensor([5.0, -3.0, 2.0])
+
+    def moved(one: Cameras) -> Cameras:
+        viewmats = one.viewmats.clone()
+        viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ by
+        return replace(one, viewmats=viewmats)
+
+    here = guidance_cameras(INPUTS, 2.0, 32, camera(30, 20))
+    there = guidance_cameras([moved(one) for one in INPUTS], 2.0, 32, moved(camera(30, 20)))
+    torch.testing.assert_close(there.focus - here.focus, by.double(), atol=1e-4, rtol=0)
+    torch.testing.assert_close(there.ahead, here.ahead, atol=1e-4, rtol=0)
+    assert here.angles is not None
+    torch.testing.assert_close(there.angles, here.angles, atol=1e-4, rtol=0)
+    assert there.distance == pytest.approx(here.distance, abs=1e-4)
+    for azimuth, elevation in ((30, 0), (120, 10), (210, 20), (0, 80)):
+        one = camera(azimuth, elevation)
+        assert there.side(moved(one), True) == here.side(one, True)
 
 
 def test_the_distance_is_the_median_and_the_view_the_narrowest() -> None:
