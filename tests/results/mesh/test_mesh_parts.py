@@ -171,6 +171,7 @@ def test_cameras_around_a_box_look_at_its_middle_from_evenly_spread_places() -> 
     torch.testing.assert_close(directions.norm(dim=1), torch.full((64,), 7.0), rtol=1e-4, atol=0)
     for camera, direction in zip(found, directions, strict=True):
         torch.testing.assert_close(camera.forwards[0], -direction / 7, atol=1e-4, rtol=0)
+        assert abs(float(camera.viewmats[0, 0, 2])) < 1e-4, "it stands upright"
     nearest = torch.cdist(directions, directions).fill_diagonal_(math.inf).amin(1) / 7
     assert float(nearest.min()) > 0.3, "64 caps of equal area have centers some 0.44 apart"
     assert float(directions.mean(0).norm()) < 0.1
