@@ -218,7 +218,7 @@ def test_errors_of_a_path_are_those_after_the_best_turn_shift_and_scale() -> Non
     world = rigid_motion(given)[:3, :3].numpy()
     angles, height = [0.0, 30.0, 90.0, 170.0], 0.5
     saddle = SQUARE + height * np.array([[0, 0, 1], [0, 0, -1]] * 2)
-    truth = cameras_at(SQUARE + [3, -2, 1], [about_z(10.0 * i) for i in range(4)])
+    truth = cameras_at(SQUARE + np.array([3, -2, 1]), [about_z(10.0 * i) for i in range(4)])
     turns = [about_z(angle + 10 * i) @ world.T for i, angle in enumerate(angles)]
     found = cameras_at(3 * saddle @ world.T + [5, 6, 7], turns)
     error = compare(found, truth)
