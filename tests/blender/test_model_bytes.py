@@ -171,3 +171,48 @@ def test_an_spz_header_says_what_is_known_here(changed: dict[str, int], refused:
             read(tmp_path, data)
     else:
         assert len(read(tmp_path, data)) == 1
+
+
+def body_of(count: int, alpha: int = 128) -> bytes:
+    """Equal splats at the origin, turned nowhere."""
+    streams = (bytes(9), bytes([alpha]), bytes([128] * 3), bytes([128] * 3), struct.pack("<I", 3 << 30))
+    return b"".join(stream * count for stream in streams)
+
+
+@pytest.mark.parametrize(("alpha", "opacity"), [(0, 0.25 / 255), (1, 1 / 255), (254, 254 / 255), (255, 1 - 0.25 / 255)])
+def test_the_ends_of_opacity_stay_a_quarter_of_a_step_within(alpha: int, opacity: float, tmp_path: Path) -> None:
+    found = read(tmp_path, packed(3, 0, body_of(1, alpha)))
+    assert found.opacities[0] == pytest.approx(opacity, rel=1e-3)
+    assert 1 - found.opacities[0] == pytest.approx(1 - opacity, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("always", "ratio", "refused"), [(20_000, 0, False), (19_999, 0, True), (0, 1000, False), (0, 50, True)]
+)
+def test_a_file_unpacks_to_so_many_bytes_or_to_so_many_times_its_size(
+    always: int, ratio: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousand splats of 20 bytes each, packed into less than 200: a hundred times."""
+    data = packed(3, 0, body_of(1000), count=1000)
+    assert 20 < len(data) < 200
+    monkeypatch.setattr(spz, "ALWAYS", always)
+    monkeypatch.setattr(spz, "RATIO", ratio)
+    if refused:
+        with pytest.raises(InputError, match="claims 1,000 splats"):
+            read(tmp_path, data)
+    else:
+        assert len(read(tmp_path, data)) == 1000
+
+
+def test_progress_is_the_share_of_the_file_that_was_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It rises in steps of a piece, from above 0 to 1."""
+    path = tmp_path / "a.spz"
+    path.write_bytes(packed(3, 0, body_of(1000), count=1000))
+    size = path.stat().st_size
+    shares: list[float] = []
+    monkeypatch.setattr(spz, "PIECE", 50)
+    spz.read_spz(path, shares.append)
+    assert shares == sorted(shares)
+    assert set(shares) <= {*(50 * i / size for i in range(1, 1 + size // 50)), 1.0}
+    assert shares[0] == pytest.approx(50 / size)
+    assert shares[-1] > 0.5
