@@ -1,0 +1,84 @@
+"""Learned features and matches join those of SIFT: in their masks, in their order, and under their own numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsopt.data.sfm import joined_features
+
+
+class Matcher:
+    """It finds what it is given."""
+
+    def features(self, pixels: np.ndarray, mask: np.ndarray | None = None) -> Any:
+        return pixels.shape, None if mask is None else mask.tolist()
+
+    def match(self, first: Any, second: Any) -> Any:
+        return first, second
+
+
+def test_a_mask_shows_from_the_middle_of_its_grays_on(tmp_path: Path) -> None:
+    """A photo without a mask counts everywhere."""
+    for name in ("a.png", "b.png"):
+        Image.new("L", (4, 2), 9).save(tmp_path / name)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    Image.fromarray(np.array([[0, 127, 128, 255]] * 2, np.uint8)).save(masks / "a.png.png")
+    matcher: Any = Matcher()
+    assert joined_features._features(matcher, tmp_path, masks, "a.png") == ((2, 4, 3), [[False, False, True, True]] * 2)
+    assert joined_features._features(matcher, tmp_path, masks, "b.png") == ((2, 4, 3), None)
+    assert joined_features._features(matcher, tmp_path, None, "a.png") == ((2, 4, 3), None)
+
+
+def test_features_are_matched_in_the_order_of_their_pair() -> None:
+    matcher: Any = Matcher()
+    found: Any = {"a": "of a", "b": "of b"}
+    assert joined_features._matched(matcher, found, ("a", "b")) == ("of a", "of b")
+    assert joined_features._matched(matcher, found, ("b", "a")) == ("of b", "of a")
+
+
+@pytest.mark.parametrize("threads", [0, 1, 3])
+def test_results_are_in_the_order_of_the_items_for_any_number_of_threads(threads: int) -> None:
+    assert joined_features._each(lambda item: item * item, range(20), threads) == [item * item for item in range(20)]
+
+
+def test_learned_matches_come_after_those_that_are_there_and_in_the_order_of_the_database(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Photo a is number 2 and has 100 features already; b is number 1 and has 50; their match is turned around."""
+    written: dict[tuple[int, int], list[list[int]]] = {}
+    images = [SimpleNamespace(name=name, image_id=number) for name, number in (("a", 2), ("b", 1), ("c", 3))]
+    there = {(1, 3): np.array([[7, 8]], np.uint32)}
+
+    class Database:
+        def __enter__(self) -> Any:
+            return SimpleNamespace(
+                read_all_images=lambda: images,
+                exists_matches=lambda *pair: pair in there,
+                read_matches=lambda *pair: there[pair],
+                delete_matches=lambda *pair: there.pop(pair),
+                write_matches=lambda a, b, rows: written.update({(a, b): rows.tolist()}),
+            )
+
+        def __exit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr(joined_features, "_append_keypoints", lambda db, number, keypoints: 50 * number)
+    points = np.zeros((9, 2))
+    rows = np.array([[1, 2], [3, 4]], np.uint32)
+    learned: Any = SimpleNamespace(
+        keypoints=dict.fromkeys("abc", points), matches={("a", "b"): rows, ("b", "c"): rows, ("a", "c"): rows}
+    )
+    project: Any = SimpleNamespace(opened=Database)
+    joined_features.join(project, learned)
+    assert written == {
+        (1, 2): [[52, 101], [54, 103]],
+        (1, 3): [[7, 8], [51, 152], [53, 154]],
+        (2, 3): [[101, 152], [103, 154]],
+    }
+    assert there == {}
