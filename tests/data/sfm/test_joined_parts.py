@@ -82,3 +82,19 @@ def test_learned_matches_come_after_those_that_are_there_and_in_the_order_of_the
         (2, 3): [[101, 152], [103, 154]],
     }
     assert there == {}
+
+
+@pytest.mark.parametrize(("columns", "shape"), [(2, []), (4, [1, 0]), (6, [1, 0, 0, 1])])
+def test_learned_keypoints_follow_with_size_one_and_no_turn(columns: int, shape: list[int]) -> None:
+    """COLMAP stores x and y, then scale and angle or a matrix of two rows."""
+    written: list[np.ndarray] = []
+    before = np.full((3, columns), 7.0, np.float32)
+    db = SimpleNamespace(
+        exists_keypoints=lambda number: True,
+        read_keypoints=lambda number: before,
+        update_keypoints=lambda number, rows: written.append(rows),
+    )
+    assert joined_features._append_keypoints(db, 4, np.array([[10.5, 20.5], [1.0, 2.0]])) == 3
+    assert np.array_equal(written[0][:3], before)
+    assert written[0][3:].tolist() == [[10.5, 20.5, *shape], [1, 2, *shape]]
+    assert written[0].dtype == np.float32

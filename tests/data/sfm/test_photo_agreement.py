@@ -284,3 +284,20 @@ def test_photos_are_compared_at_800_px_at_most(
     gray = photo_agreement._gray(tmp_path / "a.png")
     assert tuple(gray.shape) == (1, *compared)
     assert gray.unique().tolist() == [90]
+
+
+def test_a_large_jpeg_is_decoded_at_a_size_near_that_of_the_comparison(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The decoder halves a photo as long as both of its sides keep 800 px."""
+    Image.new("RGB", (4000, 3000), (9, 99, 199)).save(tmp_path / "a.jpg")
+    converted, decoded = Image.Image.convert, list[tuple[int, int]]()
+
+    def watched(image: Image.Image, mode: str) -> Image.Image:
+        decoded.append(image.size)
+        return converted(image, mode)
+
+    monkeypatch.setattr(Image.Image, "convert", watched)
+    gray = photo_agreement._gray(tmp_path / "a.jpg")
+    assert decoded == [(2000, 1500)]
+    assert gray.shape == (1, 600, 800)
