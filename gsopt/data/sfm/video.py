@@ -29,7 +29,8 @@ MEASURED_SIDE = 256
 """Longer side at which frames are measured, px."""
 TILES_PER_SIDE = 4
 MIN_MOTION, MAX_MOTION = 0.02, 0.08
-"""Between two kept frames, share of the longer side: below, near-duplicates; above, too little overlap."""
+"""Between two kept frames, share of the longer side: below, near-duplicates. Two frames with nothing in common count as
+this far apart."""
 MIN_STEP = 0.008
 """A shorter way from the anchor frame is trembling, share of the longer side (2 px at MEASURED_SIDE)."""
 CENTRAL_SHARE = 0.6
@@ -102,9 +103,7 @@ def measure(frames: Iterator[tuple[int, float, Image.Image]]) -> list[FrameMeasu
 
 def choose(measured: list[FrameMeasurement], most: int) -> list[int]:
     """Indices of the frames to keep, in order: one for every equal stretch of the way."""
-    way = measured[-1].motion
-    stretch = max(way / most, MIN_MOTION)
-    stretch = min(stretch, MAX_MOTION) if way / MAX_MOTION <= most else stretch
+    stretch = max(measured[-1].motion / most, MIN_MOTION)
     stretches: dict[int, list[FrameMeasurement]] = {}
     for frame in measured:
         stretches.setdefault(int(frame.motion / stretch), []).append(frame)
