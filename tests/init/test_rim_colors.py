@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from gsopt.geometry.cameras import Cameras
+from gsopt.init import rim_colors
+from gsopt.init.inflation import silhouette_distances
 from gsopt.init.rim_colors import LEAST_PIXELS, RIM, continued, without_rim
 from gsopt.init.thumbnails import Thumbnail
 
@@ -51,3 +54,23 @@ def test_what_is_unknown_lies_between_what_is_known() -> None:
     assert torch.equal(found[0, :, 0], torch.full((5,), 10.0))
     assert bool(((found >= 10) & (found <= 30)).all())
     assert bool((found[0, :, 5] > found[0, :, 1]).all())
+
+
+@pytest.mark.parametrize(
+    ("shape", "measured"), [((120, 400), (60, 200)), ((400, 120), (200, 60)), ((200, 90), (200, 90))]
+)
+def test_distances_are_measured_on_200_px_at_most(
+    shape: tuple[int, int], measured: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are exact up to 90 px: the longer side decides."""
+    seen: list[tuple[int, ...]] = []
+
+    def watched(solid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(tuple(solid.shape))
+        return silhouette_distances(solid)
+
+    monkeypatch.setattr(rim_colors, "silhouette_distances", watched)
+    planes = torch.zeros(4, *shape, dtype=torch.uint8)
+    planes[3, 5:-5, 5:-5] = 255
+    without_rim(Thumbnail(Cameras(torch.eye(4)[None], torch.eye(3)[None] * 50, shape[1], shape[0]), planes))
+    assert seen == [measured]
