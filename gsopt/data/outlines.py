@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gsopt.data.distances import squared_distance
-from gsopt.data.lookup import Picture, lowest
+from gsopt.data.lookup import Picture
 from gsopt.data.resample import sample
 from gsopt.geometry.cameras import Cameras
 
@@ -37,13 +37,9 @@ class Outline:
         finer = 4 if 4 * max(camera.width, camera.height) <= MAX_GRID_SIDE else 2
         return Outline(camera, alpha, signed_distance(alpha, finer))
 
-    def at(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
-        """Signed distance of projected points, px; far outside behind the camera."""
-        return lowest([self.picture], points)[0]
-
     @cached_property
     def picture(self) -> Picture:
-        """The signed distance; far outside behind the camera."""
+        """The signed distance, for lookups of points; far outside behind the camera."""
         return Picture(self.camera, self.distance[0], unseen=-float(MAX_DISTANCE))
 
     def here(self, column: Float[Tensor, "N"], row: Float[Tensor, "N"]) -> Float[Tensor, "N"]:

@@ -73,7 +73,7 @@ def test_the_rest_of_a_line_longer_than_a_piece_is_no_event(log: Path, monkeypat
 
 
 def test_a_long_line_is_over_where_its_end_is_written_later(log: Path) -> None:
-    """What follows its end is taken, also the first line that is read then."""
+    """Lines that follow its end are taken, also the first line that is read then."""
     log.write_bytes(b"x" * 100)
     follower = Follower(log.parent)
     follower.poll()

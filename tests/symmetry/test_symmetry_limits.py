@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsopt.data import outlines
+from gsopt.data.lookup import lowest
 from gsopt.data.outlines import MAX_DISTANCE, Outline
 from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
@@ -208,8 +209,8 @@ def test_outlines_are_four_times_finer_up_to_1024(side: int, finer: int) -> None
 def test_what_lies_behind_a_camera_is_far_outside() -> None:
     outline = outline_of(photo(0))
     behind = torch.tensor([[9.0, 0, 1], [40.0, 3, 2]])
-    assert outline.at(behind).tolist() == [-MAX_DISTANCE, -MAX_DISTANCE]
-    assert float(outline.at(torch.zeros(1, 3))) > 0
+    assert lowest([outline.picture], behind)[0].tolist() == [-MAX_DISTANCE, -MAX_DISTANCE]
+    assert float(lowest([outline.picture], torch.zeros(1, 3))[0]) > 0
 
 
 def test_rays_run_through_the_object_from_its_near_to_its_far_side() -> None:

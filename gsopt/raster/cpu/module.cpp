@@ -33,7 +33,7 @@ namespace portable { extern const Kernels kernels; }
 
 namespace {
 
-// Those this processor can run, best first; asked once, since under a hypervisor the question takes 0.1 ms.
+// Those this processor can run, best first; asked once: under a hypervisor each question is an exit to it.
 const std::vector<const Kernels*>& available_kernels() {
   static const auto kernels = [] {
     std::vector<const Kernels*> found;

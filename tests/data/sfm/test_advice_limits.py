@@ -38,7 +38,7 @@ def test_the_nearest_word_is_that_at_the_least_distance_not_the_longest() -> Non
 
 
 def test_words_of_features_in_clear_groups_are_the_middles_of_the_groups(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where each group holds one of the first words; a word that nobody is near stays where it was."""
+    """Each group holds one of the first words; a word that nobody is near stays where it was."""
     monkeypatch.setattr(retrieval, "WORDS", 4)
     rows = np.zeros((8, 128), np.float32)
     rows[:, 0] = 0, 2, 10, 12, 20, 22, 30, 32

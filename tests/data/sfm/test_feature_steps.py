@@ -1,4 +1,4 @@
-"""What COLMAP is asked for: features of photos, pairs to compare, and the graph that is read back."""
+"""COLMAP is asked for features of photos, pairs to compare, and the graph that is read back."""
 
 from __future__ import annotations
 

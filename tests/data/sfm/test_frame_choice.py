@@ -33,7 +33,7 @@ def test_a_tile_that_is_shifted_around_itself_gives_its_shift_and_a_peak_of_one(
 def test_a_cut_is_a_peak_below_six_over_the_root_of_a_tiles_pixels(
     peak: float, cut: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 16 tiles of 16 x 16 px, the median one. It counts as a way of 8 % of the longer side."""
+    """The median of 16 tiles of 16 x 16 px decides. It counts as a way of 8 % of the longer side."""
     tiles = iter([((3.0, 4.0), peak)] * 9 + [((3.0, 4.0), 1.0)] * 7)
     monkeypatch.setattr(video, "_correlate", lambda *_: next(tiles))
     frames = np.zeros((64, 64), np.float32), np.ones((64, 64), np.float32)

@@ -22,7 +22,7 @@ POINTS = np.random.default_rng(0).uniform(-1, 1, (COUNT, 3))
 
 
 class Database(SimpleNamespace):
-    """What is written, in order."""
+    """The database keeps all that is written, in order."""
 
     def __enter__(self) -> Database:
         self.written: list[Any] = []

@@ -19,7 +19,7 @@ MADE: Any = SimpleNamespace(reg_image_ids=lambda: list(NAMES), image=lambda i: S
 def misses(
     monkeypatch: pytest.MonkeyPatch, *, contradicted: bool, wrong: list[int], loose: bool, outlines: bool = True
 ) -> tuple[float | None, list[int]]:
-    """What is found where all views miss by 5 px and those without the second one by 1 px; and how many were asked."""
+    """All views miss by 5 px and those without the second one by 1 px: the view found, and how many were asked."""
     views = [SimpleNamespace(name=f"images/{name}") for name in NAMES.values()]
     asked: list[int] = []
 
@@ -67,7 +67,7 @@ def test_where_a_photo_has_no_outline_there_are_no_misses(monkeypatch: pytest.Mo
 def test_outlines_are_compared_where_every_placed_photo_has_a_mask(
     masks: Path | None, unmasked: list[str], compared: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What an earlier look left in the folder goes first; images are read anew, without a cache."""
+    """The remains of an earlier look go first; images are read anew, without a cache."""
     opened: list[Any] = []
     folder = tmp_path / "silhouettes"
     folder.mkdir()

@@ -28,7 +28,7 @@ CENTERS = np.array([[-1.0, -1, 0], [1, 1, 1]])
 """Cameras whose box is 2 wide, with its middle at (0, 0, 0.5): a unit is 100 * 0.44 / 1.1 = 40 px."""
 RED, GREEN = (250, 0, 0), (0, 250, 0)
 CROWD = np.full((100, 3), 0.5) * (1, -1, 1)
-"""So many points at one place that no single other one decides what is shown."""
+"""Points at one place; no single other one decides what is shown."""
 
 
 def panel(
@@ -125,7 +125,7 @@ def test_a_point_three_times_as_far_as_the_cameras_area_is_not_looked_at() -> No
 
 @pytest.mark.parametrize(("count", "right"), [(20, 4.0), (21, 3.6)])
 def test_of_more_than_twenty_points_the_outermost_twentieth_decides_nothing(count: int, right: float) -> None:
-    """Of points that lie evenly from -4 to 4 the 95 % quantile is 3.6."""
+    """The points lie evenly from -4 to 4: their 95 % quantile is 3.6."""
     line = np.linspace(-4, 4, count)
     middle, half = _window(CENTERS, np.column_stack([line, 0 * line, 0 * line + 0.5]))
     assert (middle[0], half) == (pytest.approx(0, abs=1e-9), pytest.approx(1.1 * right))

@@ -101,7 +101,7 @@ def test_cameras_are_triangles_that_open_where_they_look_and_their_path_joins_th
 
 
 def test_labels_lie_in_the_margin_above_and_names_beside_their_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of eleven cameras six have their name; a frame runs around."""
+    """Six of eleven cameras have their name; a frame runs around."""
     written: list[tuple[str, float, float]] = []
     monkeypatch.setattr(
         ImageDraw.ImageDraw, "text", lambda self, at, text, *_, **__: written.append((text, float(at[0]), float(at[1])))

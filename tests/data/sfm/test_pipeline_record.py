@@ -1,4 +1,4 @@
-"""What a run of structure from motion leaves beside its scene: a picture, and a record of what it did."""
+"""A run of structure from motion leaves a picture beside its scene, and a record of what it did."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def test_a_scene_without_a_record_or_without_poses_or_with_a_broken_record_is_an
 def test_poses_are_sought_once_and_other_photos_get_a_number(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is done is told: the search and its report, or the earlier scene."""
+    """The command tells what it does: the search and its report, or the earlier scene."""
     config, asked, told = SfmConfig(features="sift"), list[Path](), list[str]()
 
     def pose(data: Path, scene: Path, config: SfmConfig, report: Any) -> Any:

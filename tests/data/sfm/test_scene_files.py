@@ -1,4 +1,4 @@
-"""What a finished scene holds: photos and masks, cameras without distortion, points, and the way back."""
+"""A finished scene holds photos and masks, cameras without distortion, points, and the way back."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from balls import Ball, picture, ring
 
+from gsopt.data.lookup import lowest
 from gsopt.data.outlines import MAX_DISTANCE, Outline
 from gsopt.data.sfm import silhouettes
 from gsopt.data.sfm.silhouettes import Coherence, coherent_poses, contradicting
@@ -50,7 +51,7 @@ def test_a_near_point_has_its_distance_and_one_behind_the_camera_is_far_outside(
     intrinsics = torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]])
     outline = Outline.of(Cameras(torch.eye(4)[None], intrinsics, 64, 64), torch.ones(1, 64, 64))
     points = torch.tensor([[0.0, 0, 0.01], [0, 0, 0.5], [0, 0, 0], [0, 0, -1]])
-    assert outline.at(points).tolist() == pytest.approx(
+    assert lowest([outline.picture], points)[0].tolist() == pytest.approx(
         [MAX_DISTANCE, MAX_DISTANCE, -MAX_DISTANCE, -MAX_DISTANCE], abs=0.5
     )
 

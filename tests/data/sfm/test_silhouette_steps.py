@@ -67,7 +67,7 @@ def test_small_misses_are_balanced_with_the_prior(axis: int, prior: float) -> No
 
 @pytest.mark.parametrize(("axis", "prior"), [(1, TURN), (4, SHIFT)])
 def test_a_miss_beyond_two_px_pulls_as_one_of_two_px(axis: int, prior: float) -> None:
-    """Of one ray that misses by 10 px, less 100 a unit: 0.1 * 2 * 100 = p x."""
+    """One ray misses by 10 px, less 100 a unit: 0.1 * 2 * 100 = p x."""
     found = solved(linear([10.0], [-100.0], axis))
     assert found.viewmats[0, axis].item() == pytest.approx(20 / prior, rel=0.01)
 

@@ -255,7 +255,7 @@ def test_observations_move_to_where_a_pinhole_sees_them() -> None:
 
 
 def test_a_scene_appears_whole_and_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a killed search left beside it is swept away; an empty folder is no obstacle."""
+    """The remains of a killed search beside it are swept away; an empty folder is no obstacle."""
     (tmp_path / "in").mkdir()
     swept: list[Path] = []
 
