@@ -19,7 +19,7 @@ from gsopt.errors import InputError
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.quats import from_rotation_matrices
 from gsopt.results.camera_path_file import read_camera_path, write_camera_path
-from gsopt.results.viewer_path import KeyframeControls
+from gsopt.results.viewer_path import KeyframeControls, camera_of
 
 ORIGIN = (1000.0, -2000.0, 5.0)
 
@@ -133,6 +133,15 @@ def visitor(camera: Cameras) -> SimpleNamespace:
     )
 
 
+def test_a_visitor_sees_by_a_camera_of_square_pixels_about_the_center_of_the_image() -> None:
+    shot = ring(1)
+    found = camera_of(visitor(shot).camera)
+    assert torch.allclose(found.viewmats[0].float(), shot.viewmats[0], atol=1e-5)
+    focal = float(shot.Ks[0, 1, 1])
+    expected = torch.tensor([[focal, 0, shot.width / 2], [0, focal, shot.height / 2], [0, 0, 1]])
+    torch.testing.assert_close(found.Ks[0].float(), expected)
+
+
 def test_keyframes_of_the_viewer_are_saved_as_a_path_through_them(tmp_path: Path, monkeypatch) -> None:
     shots = ring(3)
     controls = KeyframeControls(MagicMock())
@@ -157,3 +166,5 @@ def test_keyframes_of_the_viewer_are_saved_as_a_path_through_them(tmp_path: Path
     assert torch.allclose(torch.tensor(guests[0].camera.position), shots.centers[2].double(), atol=1e-4)
     ahead = torch.tensor(guests[0].camera.look_at) - torch.tensor(guests[0].camera.position)
     assert torch.allclose(ahead / ahead.norm(), shots.forwards[2].double(), atol=1e-4)
+    half = math.atan(shots.height / 2 / float(shots.Ks[2, 1, 1]))
+    assert guests[0].camera.fov == pytest.approx(2 * half, rel=1e-4)

@@ -113,6 +113,18 @@ def test_the_step_is_the_gradient_of_the_stated_loss() -> None:
     assert float((found.sh0 * direction).sum()) == pytest.approx((ahead - behind) / (2 * h), rel=1e-3)
 
 
+def test_noise_levels_fill_the_range_of_the_step() -> None:
+    guided, gaussians = guide(toy(), replace(ALWAYS, t_min=0.3, t_max=0.5, t_max_end=0.5)), blobs()
+    camera = guided.observer.cameras.camera(0, guided._random(1, 0, "jitter"))
+    frame = BACKEND.forward(gaussians, camera, SETTINGS, torch.ones(3))
+    images = frame.colors.permute(2, 0, 1)[None]
+    seen = ObservedRender(camera, images, frame.alphas, torch.ones_like(frame.alphas))
+    levels = [guided._noise_sample(step, 0, seen, 2 * images - 1)[1].t for step in range(1, 101)]
+    least, most = (guided.prior.schedule.step(share) for share in (0.3, 0.5))
+    assert least <= min(levels) < least + 0.1 * (most - least)
+    assert most - 0.1 * (most - least) < max(levels) <= most
+
+
 @pytest.mark.parametrize("policy", ["sds", "sdi", "recon"])
 def test_steps_towards_a_prior_that_knows_the_answer_reach_it(policy) -> None:
     """Descent on the colors of what is uncertain brings the render to the prior's image, whatever the policy."""

@@ -153,6 +153,12 @@ def test_rescaling_mixes_with_the_contrast_of_the_conditional_half(share: float)
     torch.testing.assert_close(_rescaled(x0, conditional, share), expected)
 
 
+def test_rescaling_reaches_the_contrast_of_the_conditional_half_from_a_faint_image() -> None:
+    random = torch.Generator().manual_seed(0)
+    x0, conditional = (scale * torch.randn(1, 3, 4, 4, generator=random) for scale in (0.01, 0.5))
+    assert float(_rescaled(x0, conditional, 1.0).std()) == pytest.approx(float(conditional.std()), rel=1e-4)
+
+
 def test_images_are_given_to_clip_as_it_was_trained() -> None:
     seen: list[torch.Tensor] = []
 

@@ -121,6 +121,14 @@ def test_turns_are_compared_in_the_median_pair_and_need_no_common_axes() -> None
     assert trajectory.turns_apart(first[:1], second[:1]) == 0
 
 
+def test_equal_turns_are_no_turn_apart_whatever_rounding_says() -> None:
+    """The cosine of a pair of equal turns can exceed 1 by a rounding."""
+    axes = np.random.default_rng(0).normal(size=(200, 2, 3, 3))
+    for pair in np.linalg.qr(axes)[0]:
+        cameras = viewmats(np.zeros((2, 3)), pair)
+        assert trajectory.turns_apart(cameras, cameras) == pytest.approx(0, abs=1e-5)
+
+
 def path(*motions: float, sharpness: tuple[float, ...] = ()) -> list[FrameMeasurement]:
     sharp = sharpness or (1.0,) * len(motions)
     return [FrameMeasurement(i, i / 30, s, m) for i, (m, s) in enumerate(zip(motions, sharp, strict=True))]
