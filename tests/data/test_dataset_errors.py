@@ -114,6 +114,7 @@ def without_focal(angle: float) -> Callable[[dict[str, Any]], None]:
         (flatten_pose, "not a rotation"),
         (lambda d: d["frames"][3].pop("transform_matrix"), "must be 4 rows of 4 numbers"),
         (lambda d: d["frames"][3].update(transform_matrix=[[1, 0], [0, 1]]), "must be 4 rows of 4 numbers"),
+        (lambda d: d["frames"][3]["transform_matrix"][1].pop(), "must be 4 rows of 4 numbers"),
     ],
 )
 def test_a_broken_pose_names_its_frame(tmp_path: Path, change: Callable[..., None], message: str) -> None:

@@ -113,7 +113,7 @@ def _values(node: ast.AST, source: Source) -> Iterator[Mutant]:
     match node:
         case ast.Constant(value=bool() as value):
             yield source.replaced(node, source.start(node), source.end(node), str(not value))
-        case ast.Constant(value=int() | float() as value):
+        case ast.Constant(value=int() | float() as value) if value + 1 != value:  # a float from 2^53 on swallows it
             yield source.replaced(node, source.start(node), source.end(node), repr(value + 1))
         case ast.Call(func=ast.Name(id=name)) if name in CALLS:
             yield source.replaced(node, source.start(node), source.start(node) + len(name), CALLS[name])
