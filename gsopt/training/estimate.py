@@ -65,7 +65,7 @@ class Estimate:
 def estimate(config: TrainConfig, plan: RunPlan, scene: Scene, frozen: int = 0) -> Estimate:
     """The estimate for a run on the CPU that draws so many frozen Gaussians with its own."""
     steps, budget = plan.schedule.iterations, plan.density.max_gaussians
-    expected = max(default_budget(content_pixels(scene.train), steps), config.init.count or 0)
+    expected = max(default_budget(content_pixels(scene.train), len(scene.train), steps), config.init.count or 0)
     full = plan.density.strategy == "mcmc" or config.cell.start
     pixels = max(view.camera.width * view.camera.height for view in scene.drawn)
     count, images = budget if full else min(budget, expected), image_bytes(config, plan, scene)

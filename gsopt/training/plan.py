@@ -45,6 +45,8 @@ BY_VIEWS: dict[str, tuple[float, float]] = {
 }
 # The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
 GAUSSIANS_PER_PIXEL = 1.44
+# Pixels of all views together that a Gaussian of a longer run must have: its 59 numbers learn from three of each.
+PIXELS_PER_GAUSSIAN = 30
 MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
 # Mirror images drawn per epoch, times the number of photos: the more photos there are, the less they leave open and the
 # more the images blur what the photos show (docs/decisions/0002-symmetry.md).
@@ -129,7 +131,7 @@ class RunPlan:
         sparse = is_sparse(config.sparse, views)
         iterations = shortened(config, 2 * views if scene.completed else views)
         background = Background.of(config.data, scene)
-        budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), iterations)
+        budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), views, iterations)
         schedule = make_schedule(config, iterations, sparse, scene.extent)
         return RunPlan(
             seed=config.seed,
@@ -276,9 +278,10 @@ def density_plan(config: DensityConfig, budget: int, sparse: bool, extent: float
     )
 
 
-def default_budget(pixels: float, iterations: int) -> int:
-    """Number of Gaussians that `pixels`, those of an image that show something, can use in a run this long."""
-    longer = iterations / 7000
+def default_budget(pixels: float, views: int, iterations: int) -> int:
+    """Number of Gaussians that `views` images, each with so many `pixels` that show something, can use in a run this
+    long: more than in 7000 steps only where the views tell enough, else they learn the views by heart."""
+    longer = min(iterations / 7000, max(1, views / (GAUSSIANS_PER_PIXEL * PIXELS_PER_GAUSSIAN)))
     wanted = round(GAUSSIANS_PER_PIXEL * pixels * max(longer, math.sqrt(longer)))
     return min(max(wanted, MIN_BUDGET), MAX_BUDGET)
 

@@ -176,11 +176,16 @@ def test_few_views_shorten_a_run_and_many_never_do() -> None:
 
 
 def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
-    assert plan.default_budget(50_000, 7000) == 72_000
-    assert plan.default_budget(50_000, 28_000) == 4 * plan.default_budget(50_000, 7000)
-    assert plan.default_budget(50_000, 1750) == 36_000
-    assert plan.default_budget(1, 7000) == plan.MIN_BUDGET
-    assert plan.default_budget(1e9, 7000) == plan.MAX_BUDGET
+    assert plan.default_budget(50_000, 200, 7000) == 72_000
+    assert plan.default_budget(50_000, 200, 28_000) == 4 * plan.default_budget(50_000, 200, 7000)
+    assert plan.default_budget(50_000, 200, 1750) == 36_000
+    assert plan.default_budget(1, 200, 7000) == plan.MIN_BUDGET
+    assert plan.default_budget(1e9, 200, 7000) == plan.MAX_BUDGET
+
+
+def test_in_a_longer_run_every_gaussian_has_thirty_pixels_of_the_views() -> None:
+    assert plan.default_budget(50_000, 60, 28_000) == 60 * 50_000 / 30
+    assert plan.default_budget(50_000, 1, 28_000) == plan.default_budget(50_000, 43, 28_000) == 72_000
 
 
 def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:

@@ -78,7 +78,7 @@ def test_the_default_budget_grows_with_pixels_and_steps_within_its_bounds(
     pixels: float, iterations: int, budget: int
 ) -> None:
     """Four times the steps use four times the Gaussians, a quarter of them half as many."""
-    assert plan.default_budget(pixels, iterations) == budget
+    assert plan.default_budget(pixels, 200, iterations) == budget
 
 
 @pytest.mark.parametrize(
