@@ -154,7 +154,8 @@ class DensityConfig:
     max_gaussians: Annotated[int, Within(1, MAX_GAUSSIANS)] | None = None
     """Largest number of Gaussians; by default 1.4 per pixel that shows something, more in long runs of many views."""
     refine_start: Count | None = None
-    """First step after which Gaussians are added and removed; by default 200, with few views and for mcmc 500."""
+    """First step after which Gaussians are added and removed; by default 200, with few views of a whole scene and for
+    mcmc 500."""
     refine_stop: Count | None = None
     """Last such step; by default min(15000, 60 % of iterations) for adc, min(25000, 83 %) for mcmc."""
     refine_every: PositiveCount | None = None
@@ -208,8 +209,9 @@ class SparseConfig:
     inflate: Literal["auto", "off"] = "auto"
     """Completion of an object that one photo with a mask shows: library shapes like its silhouette, and the inflated
     silhouette, make a body, and a run learns from views of that body from other sides too."""
-    steps_per_view: Count = 500
-    """Largest number of steps per input view, since more overfit few views; 0 = no bound."""
+    steps_per_view: Count | None = None
+    """Largest number of steps per input view, since more overfit few views; 0 = no bound. By default 500, of an object
+    with masks 350."""
 
     def __post_init__(self) -> None:
         check.fields(self, "sparse")

@@ -7,7 +7,7 @@ from gsopt.data.scene import Scene
 from gsopt.errors import InputError
 from gsopt.symmetry.find import find_symmetries, with_mirror_images
 from gsopt.symmetry.symmetry import Symmetry
-from gsopt.training.plan import is_sparse
+from gsopt.training.open_settings import is_sparse
 from gsopt.training.run_directory import RunDirectory
 
 

@@ -12,9 +12,7 @@ from gsopt.config.train import (
     DensityConfig,
     ExposureConfig,
     InitConfig,
-    OptimizerConfig,
     PoseConfig,
-    SparseConfig,
     TrainConfig,
 )
 from gsopt.data.background import Background
@@ -23,26 +21,12 @@ from gsopt.geometry.focus import find_focus
 from gsopt.init.first_gaussians import FEW_PHOTOS
 from gsopt.sds.guidance_plan import GuidancePlans
 from gsopt.sds.select_prior import PriorSelection, select_prior
+from gsopt.training.open_settings import OpenSettings, is_sparse, open_settings
 from gsopt.training.schedule import Schedule
 from gsopt.training.targets import content_pixels
 
 # Published end of refinement (Kerbl et al. 2023; Kheradmand et al. 2024), and its share of a shorter run.
 REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}
-# Shares of a run drawn at a quarter and at half of the resolution. Early steps only move coarse shapes; with few views
-# a longer coarse phase keeps fine detail from being learned as view-dependent fog (docs/decisions/0001-schedule.md).
-COARSE_SHARES, COARSE_SHARES_SPARSE = (0.06, 0.23), (1 / 6, 1 / 2)
-# Settings that are left open, with many views and with few: few views are learned more slowly, and nothing makes room
-# for what they show better at the cost of what other views need (docs/decisions/0019-fewer-steps.md).
-BY_VIEWS: dict[str, tuple[float, float]] = {
-    "lr_means": (3.2e-4, 1.6e-4),
-    "lr_quats": (4e-3, 1e-3),
-    "lr_shN": (5e-4, 2.5e-4),
-    "sh_degree_every": (500, 1000),
-    "refine_start": (200, 500),
-    "refine_every": (50, 100),
-    "grow_grad2d": (1e-4, 2e-4),
-    "turnover": (0.2, 0.0),
-}
 # The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
 GAUSSIANS_PER_PIXEL = 1.44
 # Pixels of all views together that a Gaussian of a longer run must have: its 59 numbers learn from three of each.
@@ -128,11 +112,13 @@ class RunPlan:
     def of(config: TrainConfig, scene: Scene) -> RunPlan:
         """Resolves the settings against a scene, mirror images included."""
         views = len(scene.train)
-        sparse = is_sparse(config.sparse, views)
-        iterations = shortened(config, 2 * views if scene.completed else views)
+        settings = open_settings(config.sparse, views, masked=scene.has_alpha)
+        sparse = settings.few
+        iterations = shortened(config, settings, 2 * views if scene.completed else views)
         background = Background.of(config.data, scene)
-        budget = config.density.max_gaussians or default_budget(content_pixels(scene.train), views, iterations)
-        schedule = make_schedule(config, iterations, sparse, scene.extent)
+        pixels = content_pixels(scene.train)
+        budget = config.density.max_gaussians or default_budget(pixels, views, iterations)
+        schedule = make_schedule(config, iterations, settings, scene.extent, pixels)
         return RunPlan(
             seed=config.seed,
             sparse=sparse,
@@ -144,7 +130,7 @@ class RunPlan:
             cell=config.cell,
             weights=loss_weights(config, sparse, scene.has_alpha),
             schedule=schedule,
-            density=density_plan(config.density, budget, sparse, scene.extent),
+            density=density_plan(config.density, budget, settings, scene.extent),
             poses=config.poses,
             exposure=config.exposure,
             prior=select_prior(config.guidance, completed=scene.body is not None),
@@ -164,11 +150,6 @@ class RunPlan:
         return json.loads(json.dumps(asdict(self)))
 
 
-def is_sparse(config: SparseConfig, views: int) -> bool:
-    """True when the regularizers for few views are on."""
-    return views <= config.below_views
-
-
 def near_distance(scene: Scene) -> float:
     """NEAR_SHARE of the cameras' distance to what they all look at; 0 where they look at no one place."""
     focus = find_focus([view.camera for view in scene.train], scene.extent)
@@ -186,19 +167,23 @@ def matches_photos(config: TrainConfig, scene: Scene) -> bool:
     return few and not scene.has_alpha and config.loss.lambda_depth > 0 and config.data.depth is None
 
 
-def shortened(config: TrainConfig, views: int) -> int:
+def shortened(config: TrainConfig, settings: OpenSettings, views: int) -> int:
     """The number of steps, no more than few views can use."""
-    per_view = config.sparse.steps_per_view
-    if per_view == 0 or not is_sparse(config.sparse, views):
+    per_view = settings.of(config.sparse)["steps_per_view"]
+    if per_view == 0 or not settings.few:
         return config.iterations
     return min(config.iterations, per_view * views)
 
 
-def make_schedule(config: TrainConfig, iterations: int, sparse: bool, extent: float) -> Schedule:
-    """The schedule of a run of so many steps. No rate falls at the end with few views, where the noise of single steps
-    acts as a regularizer against overfitting (docs/decisions/0001-schedule.md); few views cannot tell view dependence
-    from shape, so that they get fewer bands."""
-    density, optimizer = growth_settings(config.density, sparse), by_views(config.optimizer, sparse)
+def make_schedule(
+    config: TrainConfig, iterations: int, settings: OpenSettings, extent: float, pixels: float
+) -> Schedule:
+    """The schedule of a run of so many steps, whose images have so many pixels that show something.
+
+    No rate falls at the end with few views, where the noise of single steps acts as a regularizer against overfitting
+    (docs/decisions/0001-schedule.md); few views cannot tell view dependence from shape, so that they get fewer bands.
+    """
+    density, optimizer, few = settings.growth(config.density), settings.of(config.optimizer), settings.few
     degree = config.optimizer.sh_degree
     return Schedule(
         iterations=iterations,
@@ -206,35 +191,28 @@ def make_schedule(config: TrainConfig, iterations: int, sparse: bool, extent: fl
         optimizer=replace(config.optimizer, **optimizer),
         lr_means_first=optimizer["lr_means"],
         sh_degree_every=optimizer["sh_degree_every"],
-        settling=0 if sparse else math.ceil(SETTLING_SHARE * iterations),
-        coarse_until=coarse_until(config.schedule.coarse_until, iterations, sparse),
-        max_sh_degree=min(degree, config.sparse.sh_degree) if sparse else degree,
+        settling=0 if few else math.ceil(SETTLING_SHARE * iterations),
+        coarse_until=coarse_until(config.schedule.coarse_until, settings, iterations, pixels),
+        max_sh_degree=min(degree, config.sparse.sh_degree) if few else degree,
         refine_start=density["refine_start"],
         refine_stop=refine_stop(config.density, iterations),
         refine_every=density["refine_every"],
         reset_every=config.density.reset_every,
-        max_dropout=config.sparse.dropout if sparse else 0.0,
-        floater_every=config.sparse.floater_every if sparse else 0,
+        max_dropout=config.sparse.dropout if few else 0.0,
+        floater_every=config.sparse.floater_every if few else 0,
     )
 
 
-def by_views(section: OptimizerConfig | DensityConfig, sparse: bool) -> dict[str, Any]:
-    """The settings of a section that the number of views decides where they are left open."""
-    given = {name: getattr(section, name) for name in BY_VIEWS if hasattr(section, name)}
-    return {name: BY_VIEWS[name][sparse] if value is None else value for name, value in given.items()}
-
-
-def growth_settings(config: DensityConfig, sparse: bool) -> dict[str, Any]:
-    """Those of density control; mcmc, whose growth is a share per refinement, refines as rarely as with few views."""
-    return by_views(config, sparse or config.strategy == "mcmc")
-
-
-def coarse_until(given: tuple[int, ...] | None, iterations: int, sparse: bool) -> tuple[int, ...]:
-    """Last steps at a quarter and at half of the resolution, as given or as shares of the run."""
+def coarse_until(
+    given: tuple[int, ...] | None, settings: OpenSettings, iterations: int, pixels: float
+) -> tuple[int, ...]:
+    """Last steps at a quarter and at half of the resolution, as given or as shares of the run, without those whose
+    images would show too little."""
     if given is not None:
         return given
-    steps = (round(share * iterations) for share in (COARSE_SHARES_SPARSE if sparse else COARSE_SHARES))
-    return tuple(step for step in steps if step > 0)
+    halved = zip(range(len(settings.coarse_shares), 0, -1), settings.coarse_shares, strict=True)
+    shares = [share for times, share in halved if pixels / 4**times >= settings.least_content]
+    return tuple(step for step in (round(share * iterations) for share in shares) if step > 0)
 
 
 def refine_stop(config: DensityConfig, iterations: int) -> int:
@@ -262,17 +240,17 @@ def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool) -> LossWeig
     return LossWeights(loss.lambda_dssim, *raised, loss.lambda_depth, few.lambda_unseen)
 
 
-def density_plan(config: DensityConfig, budget: int, sparse: bool, extent: float) -> DensityPlan:
+def density_plan(config: DensityConfig, budget: int, settings: OpenSettings, extent: float) -> DensityPlan:
     """The parameters of density control; lengths in scene units."""
-    settings = growth_settings(config, sparse)
+    growth = settings.growth(config)
     return DensityPlan(
         strategy=config.strategy,
         max_gaussians=budget,
-        grow_grad2d=settings["grow_grad2d"],
+        grow_grad2d=growth["grow_grad2d"],
         absgrad=config.absgrad,
         prune_opacity=config.prune_opacity,
         prune_scale=config.prune_scale3d * extent,
-        turnover=settings["turnover"] if config.strategy == "adc" else 0.0,
+        turnover=growth["turnover"] if config.strategy == "adc" else 0.0,
         noise_lr=config.noise_lr,
         growth=config.growth,
     )

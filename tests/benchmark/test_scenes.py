@@ -15,6 +15,7 @@ from gsopt.cli import bench
 from gsopt.config.presets import PRESETS
 from gsopt.config.train import DataConfig
 from gsopt.errors import InputError, UsageError
+from gsopt.training.open_settings import FEW_OF_AN_OBJECT
 from gsopt.training.plan import shortened
 
 
@@ -89,7 +90,7 @@ def test_a_task_with_a_length_or_a_budget_belongs_to_the_grid() -> None:
     assert Task("a", data, "high").kind == "curve"
     assert Task("a", data, iterations=5).kind == Task("a", data, max_gaussians=5).kind == "grid"
     assert Task("a", data, "high").config().iterations == PRESETS["high"]["iterations"]
-    steps = shortened(Task("a", data, iterations=6000).config(), 1)
+    steps = shortened(Task("a", data, iterations=6000).config(), FEW_OF_AN_OBJECT, 1)
     assert steps == 6000  # a point of the grid is as long as its record says
 
 

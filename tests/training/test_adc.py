@@ -15,6 +15,7 @@ from gsopt.gaussians import Gaussians
 from gsopt.raster.backend import Gradients
 from gsopt.training.density import at_least_one
 from gsopt.training.density.adc import HALF_DISTANCE, HALF_LENGTH, Adc, best, split
+from gsopt.training.open_settings import MANY
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan, density_plan, make_schedule
 from gsopt.training.schedule import Schedule
@@ -25,8 +26,8 @@ ITERATIONS = 10_000
 
 
 def plan_of(config: DensityConfig) -> tuple[DensityPlan, Schedule]:
-    schedule = make_schedule(TrainConfig(density=config), ITERATIONS, sparse=False, extent=EXTENT)
-    return density_plan(config, config.max_gaussians or 10**6, False, EXTENT), schedule
+    schedule = make_schedule(TrainConfig(density=config), ITERATIONS, MANY, extent=EXTENT, pixels=1.0)
+    return density_plan(config, config.max_gaussians or 10**6, MANY, EXTENT), schedule
 
 
 def controlled(model: OptimizedGaussians, config: DensityConfig = CONFIG) -> Adc:

@@ -16,6 +16,7 @@ from gsopt.raster.backend import RasterSettings
 from gsopt.training import plan
 from gsopt.training.density import contribution
 from gsopt.training.density.contribution import contributions, least
+from gsopt.training.open_settings import MANY
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -71,7 +72,7 @@ def test_the_lowest_go_first_in_row_order_and_one_always_stays(share: float, cou
 
 def test_room_is_made_three_times_in_the_second_half_of_refinement() -> None:
     config = TrainConfig()
-    schedule = plan.make_schedule(config, config.iterations, sparse=False, extent=1.0)
+    schedule = plan.make_schedule(config, config.iterations, MANY, extent=1.0, pixels=1.0)
     due = [step for step in range(1, config.iterations + 1) if schedule.turns_over(step)]
     assert schedule.refine_stop == 2400
     assert due == [1200, 1600, 2000]
@@ -79,8 +80,8 @@ def test_room_is_made_three_times_in_the_second_half_of_refinement() -> None:
 
 def test_only_adc_makes_room() -> None:
     adc = DensityConfig(turnover=0.2)
-    assert plan.density_plan(adc, 100, False, 1.0).turnover == 0.2
-    assert plan.density_plan(replace(adc, strategy="mcmc"), 100, False, 1.0).turnover == 0
+    assert plan.density_plan(adc, 100, MANY, 1.0).turnover == 0.2
+    assert plan.density_plan(replace(adc, strategy="mcmc"), 100, MANY, 1.0).turnover == 0
 
 
 def test_twenty_five_views_are_looked_at_where_there_are_more() -> None:

@@ -14,6 +14,7 @@ from tiny_scenes import cloud
 from gsopt.config.train import DensityConfig, TrainConfig
 from gsopt.raster.reference import covariances
 from gsopt.training.density.mcmc import Mcmc, draw, shared, spread
+from gsopt.training.open_settings import MANY
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import density_plan, make_schedule
 
@@ -21,8 +22,8 @@ CONFIG = DensityConfig(strategy="mcmc", refine_start=0, refine_every=10, refine_
 
 
 def controlled(config: DensityConfig = CONFIG) -> Mcmc:
-    schedule = make_schedule(TrainConfig(density=config), 1000, sparse=False, extent=1.0)
-    plan = density_plan(config, config.max_gaussians or 10**6, sparse=False, extent=1.0)
+    schedule = make_schedule(TrainConfig(density=config), 1000, MANY, extent=1.0, pixels=1.0)
+    plan = density_plan(config, config.max_gaussians or 10**6, MANY, extent=1.0)
     return Mcmc(plan, schedule, torch.Generator().manual_seed(0))
 
 

@@ -10,24 +10,32 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsopt.config.train import DensityConfig, LossConfig, OptimizerConfig, SparseConfig, TrainConfig
+from gsopt.config.train import DensityConfig, LossConfig, OptimizerConfig, ScheduleConfig, SparseConfig, TrainConfig
 from gsopt.training import plan, schedule
+from gsopt.training.open_settings import FEW_OF_A_SCENE, FEW_OF_AN_OBJECT, MANY, is_sparse, open_settings
 from gsopt.training.plan import LossWeights
 from gsopt.training.schedule import Flatness, Schedule
 
 OPTIMIZER = OptimizerConfig()
 
 
-def made(config: TrainConfig, *, views: int = 100, extent: float = 1.0) -> Schedule:
+def made(
+    config: TrainConfig, *, views: int = 100, masked: bool = False, extent: float = 1.0, pixels: float = 1e6
+) -> Schedule:
     """The schedule of a run with so many views."""
-    iterations, sparse = plan.shortened(config, views), plan.is_sparse(config.sparse, views)
-    return plan.make_schedule(config, iterations, sparse, extent)
+    found = open_settings(config.sparse, views, masked=masked)
+    return plan.make_schedule(config, plan.shortened(config, found, views), found, extent, pixels)
+
+
+def length(config: TrainConfig, views: int, *, masked: bool = False) -> int:
+    """Length of a run with so many views."""
+    return plan.shortened(config, open_settings(config.sparse, views, masked=masked), views)
 
 
 def test_the_rate_of_the_means_ends_where_it_should_and_falls_by_the_same_factor_every_step() -> None:
     run = made(TrainConfig(iterations=500), extent=2.0)
     rates = [run.lr_means(step) for step in range(501)]
-    assert rates[0] == pytest.approx(2 * plan.BY_VIEWS["lr_means"][0])
+    assert rates[0] == pytest.approx(2 * MANY.lr_means)
     assert rates[-1] == pytest.approx(2 * OPTIMIZER.lr_means_final)
     factors = {round(after / before, 9) for before, after in itertools.pairwise(rates)}
     assert len(factors) == 1
@@ -63,12 +71,12 @@ def test_few_views_are_learned_more_slowly_and_what_is_given_stays() -> None:
     assert few.lr_means(0) < many.lr_means(0)
     assert few.refine_every > many.refine_every
     assert few.learning_rates(1, 4000)["quats"] < many.learning_rates(1, 4000)["quats"]
-    assert plan.density_plan(DensityConfig(), 100, True, 1.0).turnover == 0
+    assert plan.density_plan(DensityConfig(), 100, FEW_OF_A_SCENE, 1.0).turnover == 0
     given = TrainConfig(optimizer=OptimizerConfig(lr_quats=0.5), density=DensityConfig(refine_every=7, turnover=0.1))
     for views in (4, 100):
         run = made(given, views=views)
         assert (run.learning_rates(1, 4000)["quats"], run.refine_every) == (0.5, 7)
-    assert plan.density_plan(given.density, 100, True, 1.0).turnover == 0.1
+    assert plan.density_plan(given.density, 100, FEW_OF_A_SCENE, 1.0).turnover == 0.1
 
 
 def test_resolution_doubles_at_every_entry_and_ends_full() -> None:
@@ -114,7 +122,7 @@ def test_few_views_raise_weights_and_lower_bands_but_never_the_other_way() -> No
     opacity, scale = config.sparse.lambda_opacity, config.sparse.lambda_scale
     unseen = config.sparse.lambda_unseen
     assert few == LossWeights(dssim=0.2, alpha=0.5, opacity=opacity, scale=scale, depth=0.1, unseen=unseen)
-    assert [plan.is_sparse(config.sparse, views) for views in (4, 5)] == [True, False]
+    assert [is_sparse(config.sparse, views) for views in (4, 5)] == [True, False]
     assert (made(config, views=4).max_sh_degree, made(config, views=5).max_sh_degree) == (1, 3)
 
 
@@ -168,11 +176,13 @@ def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
 
 def test_few_views_shorten_a_run_and_many_never_do() -> None:
     config = TrainConfig()
-    per_view, few = config.sparse.steps_per_view, config.sparse.below_views
-    assert [plan.shortened(config, views) for views in (1, 4, 8)] == [per_view, 4 * per_view, 8 * per_view]
-    assert plan.shortened(config, few) == plan.shortened(config, few + 1) == config.iterations
-    assert plan.shortened(config.with_steps(7000), 1) == 7000
-    assert plan.shortened(TrainConfig(iterations=50), 4) == 50
+    per_view, few = FEW_OF_A_SCENE.steps_per_view, config.sparse.below_views
+    assert [length(config, views) for views in (1, 4, 8)] == [per_view, 4 * per_view, 8 * per_view]
+    assert length(config, few) == length(config, few + 1) == config.iterations
+    assert length(config, 4, masked=True) == 4 * FEW_OF_AN_OBJECT.steps_per_view < length(config, 4)
+    assert length(config.with_steps(7000), 1) == 7000
+    assert length(TrainConfig(iterations=50), 4) == 50
+    assert length(TrainConfig(sparse=SparseConfig(steps_per_view=7)), 4, masked=True) == 28
 
 
 def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
@@ -189,9 +199,21 @@ def test_in_a_longer_run_every_gaussian_has_thirty_pixels_of_the_views() -> None
 
 
 def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
-    assert plan.coarse_until(None, 1000, sparse=False) == (60, 230)
-    assert plan.coarse_until(None, 1000, sparse=True) == (167, 500)
-    assert plan.coarse_until((), 1000, sparse=False) == ()
+    config = TrainConfig(iterations=1000)
+    assert made(config).coarse_until == (60, 230)
+    assert made(config, views=4).coarse_until == (167, 500)
+    assert made(config, pixels=1).coarse_until == (60, 230)
+    given = replace(config, schedule=ScheduleConfig(coarse_until=(5,)))
+    assert made(given, views=4, masked=True, pixels=1).coarse_until == (5,)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "coarse"), [(15_999, ()), (16_000, (230,)), (63_999, (230,)), (64_000, (60, 230)), (1e7, (60, 230))]
+)
+def test_an_object_in_few_views_shows_at_least_4000_pixels(pixels: float, coarse: tuple[int, ...]) -> None:
+    run = made(TrainConfig(iterations=1000), views=4, masked=True, pixels=pixels)
+    assert run.coarse_until == coarse
+    assert pixels / run.downscale(1) ** 2 >= min(pixels, 4000)
 
 
 @pytest.mark.parametrize(
@@ -213,15 +235,16 @@ def test_the_last_eighth_is_averaged_where_nothing_is_added_in_it(iterations: in
 
 
 def test_settings_that_are_left_open_are_those_of_decision_19() -> None:
-    """docs/decisions/0019-fewer-steps.md; mcmc refines as with few views."""
+    """docs/decisions/0019-fewer-steps.md and 0028-small-objects.md; mcmc refines as with few views."""
     config, mcmc = TrainConfig(), TrainConfig(density=DensityConfig(strategy="mcmc"))
+    sets = (MANY, FEW_OF_A_SCENE, FEW_OF_AN_OBJECT)
     many = {"lr_means": 3.2e-4, "lr_quats": 4e-3, "lr_shN": 5e-4, "sh_degree_every": 500}
     few = {"lr_means": 1.6e-4, "lr_quats": 1e-3, "lr_shN": 2.5e-4, "sh_degree_every": 1000}
-    assert [plan.by_views(config.optimizer, sparse) for sparse in (False, True)] == [many, few]
+    assert [found.of(config.optimizer) for found in sets] == [many, few, few]
     growth = {"refine_start": 200, "refine_every": 50, "grow_grad2d": 1e-4, "turnover": 0.2}
     rare = {"refine_start": 500, "refine_every": 100, "grow_grad2d": 2e-4, "turnover": 0.0}
-    assert [plan.growth_settings(config.density, sparse) for sparse in (False, True)] == [growth, rare]
-    assert plan.growth_settings(mcmc.density, sparse=False) == rare
+    assert [found.growth(config.density) for found in sets] == [growth, rare, {**rare, "refine_start": 200}]
+    assert [found.growth(mcmc.density) for found in sets] == [rare] * 3
     assert (made(config).refine_every, made(mcmc).refine_every) == (50, 100)
 
 

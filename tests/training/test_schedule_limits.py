@@ -16,6 +16,7 @@ from gsopt.data.scene import Scene, load_scene
 from gsopt.geometry import sh
 from gsopt.raster.backend import Gradients
 from gsopt.training import plan
+from gsopt.training.open_settings import FEW_OF_AN_OBJECT, MANY
 from gsopt.training.plan import RunPlan
 from gsopt.training.schedule import Flatness, Schedule
 from gsopt.training.skipping import Bands
@@ -81,13 +82,11 @@ def test_the_default_budget_grows_with_pixels_and_steps_within_its_bounds(
     assert plan.default_budget(pixels, 200, iterations) == budget
 
 
-@pytest.mark.parametrize(
-    ("strategy", "sparse", "turnover"), [("adc", False, 0.2), ("adc", True, 0.0), ("mcmc", False, 0)]
-)
-def test_only_adc_with_many_views_makes_room(strategy: Any, sparse: bool, turnover: float) -> None:
-    config = DensityConfig(strategy=strategy)
-    assert plan.density_plan(config, 5, sparse, 2.0).turnover == turnover
-    given = plan.density_plan(replace(config, turnover=0.5), 5, sparse, 2.0)
+@pytest.mark.parametrize(("strategy", "few", "turnover"), [("adc", False, 0.2), ("adc", True, 0.0), ("mcmc", False, 0)])
+def test_only_adc_with_many_views_makes_room(strategy: Any, few: bool, turnover: float) -> None:
+    config, found = DensityConfig(strategy=strategy), FEW_OF_AN_OBJECT if few else MANY
+    assert plan.density_plan(config, 5, found, 2.0).turnover == turnover
+    given = plan.density_plan(replace(config, turnover=0.5), 5, found, 2.0)
     assert given.turnover == (0.5 if strategy == "adc" else 0.0)
 
 

@@ -17,6 +17,7 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import RasterSettings
 from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.loop import TrainResult, train
+from gsopt.training.open_settings import FEW_OF_AN_OBJECT
 from gsopt.training.plan import RunPlan
 
 pytestmark = pytest.mark.usefixtures("coarse_hull")
@@ -65,8 +66,8 @@ def test_a_guess_doubles_the_steps_that_a_photo_is_given(one_photo: Path) -> Non
     scene = load_scene(DataConfig(path=str(one_photo)))
     config = TrainConfig(data=DataConfig(path=str(one_photo)))
     guessed = replace(scene, guessed=scene.train)
-    assert RunPlan.of(config, scene).schedule.iterations == config.sparse.steps_per_view
-    assert RunPlan.of(config, guessed).schedule.iterations == 2 * config.sparse.steps_per_view
+    assert RunPlan.of(config, scene).schedule.iterations == FEW_OF_AN_OBJECT.steps_per_view
+    assert RunPlan.of(config, guessed).schedule.iterations == 2 * FEW_OF_AN_OBJECT.steps_per_view
     assert RunPlan.of(config, guessed).extra_per_epoch == 1
 
 

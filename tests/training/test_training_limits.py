@@ -24,6 +24,7 @@ from gsopt.training.cells import stages
 from gsopt.training.cells.plan import Cell
 from gsopt.training.checkpoint import Checkpoint
 from gsopt.training.frame_loss import depth_gradients
+from gsopt.training.open_settings import MANY
 from gsopt.training.plan import RunPlan
 from gsopt.training.skipping import Bands, Resting
 from gsopt.training.targets import Target, content_pixels
@@ -84,8 +85,8 @@ def test_guessed_views_are_one_beside_every_photo() -> None:
 
 
 def test_a_short_run_has_no_coarse_step_of_none() -> None:
-    assert plan.coarse_until(None, 8, sparse=False) == (2,)
-    assert plan.coarse_until(None, 2, sparse=False) == ()
+    assert plan.coarse_until(None, MANY, 8, 1e6) == (2,)
+    assert plan.coarse_until(None, MANY, 2, 1e6) == ()
 
 
 def test_targets_take_half_as_much_memory_as_images(dataset: Path) -> None:
@@ -340,7 +341,7 @@ def test_the_stages_of_cells_are_shares_of_one_run(tmp_path: Path) -> None:
     config = TrainConfig(iterations=1001, density=DensityConfig(refine_start=100))
     coarse = stages.coarse_stage(config, 4, 1001).config
     assert (coarse.iterations, coarse.density.max_gaussians, coarse.density.refine_start) == (301, 251, 30)
-    assert coarse.optimizer.sh_degree_every == math.ceil(0.3 * plan.BY_VIEWS["sh_degree_every"][0])
+    assert coarse.optimizer.sh_degree_every == math.ceil(0.3 * MANY.sh_degree_every)
     cell = Cell("07", (0.0, 0.0), (1.0, 1.0), (0.0, 0.0), ("a", "b", "c"), 77)
     fine = stages.cell_stage(config, cell, 12, tmp_path)
     assert (fine.name, fine.config.iterations, fine.config.density.max_gaussians) == ("cells/07", 201, 77)

@@ -20,7 +20,7 @@ from gsopt.farm.worker import serving
 from gsopt.raster.cpu_backend import ISA_VARIABLE, workspace
 from gsopt.training.cells.plan import Cell
 from gsopt.training.interrupt import StopRequest
-from gsopt.training.plan import by_views, growth_settings
+from gsopt.training.open_settings import MANY
 from gsopt.training.run_directory import RunDirectory
 
 COARSE_SHARE, CELL_SHARE, POLISH_SHARE = 0.3, 0.8, 0.3
@@ -66,9 +66,9 @@ def polish_stage(config: TrainConfig, gaussians: int, run: Path) -> Stage:
 def _changed(config: TrainConfig, share: float, max_gaussians: int) -> TrainConfig:
     """The same with a share of the steps, those before the first Gaussians are added too, and so many at most."""
     steps = max(1, math.ceil(share * config.iterations))
-    start = math.ceil(share * growth_settings(config.density, sparse=False)["refine_start"])
+    start = math.ceil(share * MANY.growth(config.density)["refine_start"])
     density = replace(config.density, max_gaussians=max_gaussians, refine_start=start)
-    every = max(1, math.ceil(share * by_views(config.optimizer, sparse=False)["sh_degree_every"]))
+    every = max(1, math.ceil(share * MANY.of(config.optimizer)["sh_degree_every"]))
     optimizer = replace(config.optimizer, sh_degree_every=every)
     return replace(config.with_steps(steps), cells="", density=density, optimizer=optimizer)
 
