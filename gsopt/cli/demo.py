@@ -22,7 +22,7 @@ class Flags:
 
     run: Annotated[Path | None, tyro.conf.arg(aliases=["-m"])] = None
     """Folder to write to; runs/demo, or the first free runs/demo-2, runs/demo-3, ... when not given."""
-    iterations: int = 2000
+    iterations: int = 1600
     """Training steps."""
 
 
