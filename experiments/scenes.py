@@ -25,7 +25,7 @@ DEMO, LEGO, FOX = "gsopt/demo", "nerf_synthetic_lego_400", "fox"
 # The eight input views of the few-shot protocol (Jain et al. 2021).
 EIGHT = ["--view-ids", "2,16,26,55,73,75,86,93"]
 CASES: dict[str, tuple[str, list[str]]] = {
-    "demo": (DEMO, ["--iterations", "2000", "--lambda-sds", "0"]),  # as `make demo`, which installs no diffusers
+    "demo": (DEMO, ["--iterations", "1600", "--lambda-sds", "0"]),  # as `make demo`, which installs no diffusers
     "lego-100": (LEGO, []),
     "lego-100-30k": (LEGO, ["--iterations", "30000"]),
     "lego-8": (LEGO, EIGHT),
