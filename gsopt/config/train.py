@@ -223,7 +223,7 @@ class ScheduleConfig:
 
     coarse_until: tuple[int, ...] | None = None
     """Steps at which the resolution doubles, e.g. 500 1500: quarter, half, full. By default shares of the run
-    (training/plan.py); the flag without a step means full resolution throughout."""
+    (training/open_settings.py); the flag without a step means full resolution throughout."""
     stop_when_flat: bool = False
     """Stop early when the loss over the input views no longer falls (criterion: training/schedule.py)."""
     crop_masked: bool = False

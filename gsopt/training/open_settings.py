@@ -20,7 +20,7 @@ class OpenSettings:
     """One set; most fields are those of OptimizerConfig, DensityConfig and SparseConfig."""
 
     few: bool
-    """True with few views."""
+    """True where the regularizers for few views are on."""
     lr_means: float
     lr_quats: float
     lr_shN: float
@@ -33,7 +33,7 @@ class OpenSettings:
     coarse_shares: tuple[float, ...]
     """Shares of the run drawn at a quarter and at half of the resolution."""
     least_content: int
-    """Pixels that show something which the smallest image drawn has in the mean; larger ones are drawn where not."""
+    """Fewest pixels that show something, mean over the photos, in an image smaller than a photo."""
 
     def of(self, section: OptimizerConfig | DensityConfig | SparseConfig) -> dict[str, Any]:
         """The settings of a section that may be left open, as it gives them or else as they are here."""

@@ -203,8 +203,9 @@ def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:
     assert made(config).coarse_until == (60, 230)
     assert made(config, views=4).coarse_until == (167, 500)
     assert made(config, pixels=1).coarse_until == (60, 230)
-    given = replace(config, schedule=ScheduleConfig(coarse_until=(5,)))
-    assert made(given, views=4, masked=True, pixels=1).coarse_until == (5,)
+    for coarse in ((), (5,)):
+        asked = replace(config, schedule=ScheduleConfig(coarse_until=coarse))
+        assert made(asked).coarse_until == made(asked, views=4, masked=True, pixels=1).coarse_until == coarse
 
 
 @pytest.mark.parametrize(
@@ -234,7 +235,7 @@ def test_the_last_eighth_is_averaged_where_nothing_is_added_in_it(iterations: in
     assert replace(run, coarse_until=(5, iterations - 2)).averages_after == iterations - 2
 
 
-def test_settings_that_are_left_open_are_those_of_decision_19() -> None:
+def test_settings_that_are_left_open_are_those_of_decisions_19_and_28() -> None:
     """docs/decisions/0019-fewer-steps.md and 0028-small-objects.md; mcmc refines as with few views."""
     config, mcmc = TrainConfig(), TrainConfig(density=DensityConfig(strategy="mcmc"))
     sets = (MANY, FEW_OF_A_SCENE, FEW_OF_AN_OBJECT)
