@@ -110,9 +110,12 @@ def finite(name: str, tensor: Tensor, largest: float = math.inf) -> None:
     """Raise InputError naming the first element of `tensor` that is NaN, infinite or beyond `largest` in magnitude."""
     import torch
 
-    good = torch.isfinite(tensor) & (tensor.abs() <= largest)
-    if bool(good.all()):
+    if tensor.numel() == 0:
         return
+    lowest, highest = (bound.item() for bound in tensor.aminmax())  # either is NaN where any element is
+    if math.isfinite(lowest) and math.isfinite(highest) and max(-lowest, highest) <= largest:
+        return
+    good = torch.isfinite(tensor) & (tensor.abs() <= largest)
     index = tuple(torch.nonzero(~good)[0].tolist())
     got = tensor[index].item()
     limit = "" if math.isinf(largest) else f" and within {largest:.3g}"

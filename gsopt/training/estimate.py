@@ -14,6 +14,7 @@ from gsopt import check
 from gsopt.config.train import TrainConfig
 from gsopt.data.scene import Scene
 from gsopt.errors import InputError
+from gsopt.training.open_settings import open_settings
 from gsopt.training.plan import RunPlan, default_budget
 from gsopt.training.targets import content_pixels
 
@@ -65,7 +66,9 @@ class Estimate:
 def estimate(config: TrainConfig, plan: RunPlan, scene: Scene, frozen: int = 0) -> Estimate:
     """The estimate for a run on the CPU that draws so many frozen Gaussians with its own."""
     steps, budget = plan.schedule.iterations, plan.density.max_gaussians
-    expected = max(default_budget(content_pixels(scene.train), len(scene.train), steps), config.init.count or 0)
+    views = len(scene.train)
+    per_pixel = open_settings(config.sparse, views, masked=scene.has_alpha).gaussians_per_pixel
+    expected = max(default_budget(content_pixels(scene.train), views, steps, per_pixel), config.init.count)
     full = plan.density.strategy == "mcmc" or config.cell.start
     pixels = max(view.camera.width * view.camera.height for view in scene.drawn)
     count, images = budget if full else min(budget, expected), image_bytes(config, plan, scene)

@@ -30,6 +30,8 @@ class OpenSettings:
     grow_grad2d: float
     turnover: float
     steps_per_view: int
+    gaussians_per_pixel: float
+    """Default budget of 7000 steps, per pixel of an image that shows something."""
     coarse_shares: tuple[float, ...]
     """Shares of the run drawn at a quarter and at half of the resolution."""
     least_content: int
@@ -56,6 +58,7 @@ MANY = OpenSettings(
     grow_grad2d=1e-4,
     turnover=0.2,
     steps_per_view=0,
+    gaussians_per_pixel=1.44,
     coarse_shares=(0.06, 0.23),
     least_content=0,
 )
@@ -70,11 +73,17 @@ FEW_OF_A_SCENE = OpenSettings(
     grow_grad2d=2e-4,
     turnover=0.0,
     steps_per_view=500,
+    gaussians_per_pixel=1.44,
     coarse_shares=(1 / 6, 1 / 2),
     least_content=0,
 )
 FEW_OF_AN_OBJECT = replace(
-    FEW_OF_A_SCENE, refine_start=200, steps_per_view=350, coarse_shares=MANY.coarse_shares, least_content=4000
+    FEW_OF_A_SCENE,
+    refine_start=200,
+    steps_per_view=350,
+    gaussians_per_pixel=1.72,
+    coarse_shares=MANY.coarse_shares,
+    least_content=4000,
 )
 
 

@@ -27,8 +27,6 @@ from gsopt.training.targets import content_pixels
 
 # Published end of refinement (Kerbl et al. 2023; Kheradmand et al. 2024), and its share of a shorter run.
 REFINE_STOP = {"adc": (15_000, 0.6), "mcmc": (25_000, 0.83)}
-# The default budget, per pixel of an image that shows something, for 7000 steps: adc left to itself ends near it.
-GAUSSIANS_PER_PIXEL = 1.44
 # Pixels of all views together that a Gaussian of a longer run must have: its 59 numbers learn from three of each.
 PIXELS_PER_GAUSSIAN = 30
 MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
@@ -117,7 +115,7 @@ class RunPlan:
         iterations = shortened(config, settings, 2 * views if scene.completed else views)
         background = Background.of(config.data, scene)
         pixels = content_pixels(scene.train)
-        budget = config.density.max_gaussians or default_budget(pixels, views, iterations)
+        budget = config.density.max_gaussians or default_budget(pixels, views, iterations, settings.gaussians_per_pixel)
         schedule = make_schedule(config, iterations, settings, scene.extent, pixels)
         return RunPlan(
             seed=config.seed,
@@ -256,11 +254,12 @@ def density_plan(config: DensityConfig, budget: int, settings: OpenSettings, ext
     )
 
 
-def default_budget(pixels: float, views: int, iterations: int) -> int:
+def default_budget(pixels: float, views: int, iterations: int, per_pixel: float) -> int:
     """Number of Gaussians that `views` images, each with so many `pixels` that show something, can use in a run this
-    long: more than in 7000 steps only where the views tell enough, else they learn the views by heart."""
-    longer = min(iterations / 7000, max(1, views / (GAUSSIANS_PER_PIXEL * PIXELS_PER_GAUSSIAN)))
-    wanted = round(GAUSSIANS_PER_PIXEL * pixels * max(longer, math.sqrt(longer)))
+    long: in 7000 steps `per_pixel` for each, and more only where the views tell enough, else they learn the views by
+    heart."""
+    longer = min(iterations / 7000, max(1, views / (per_pixel * PIXELS_PER_GAUSSIAN)))
+    wanted = round(per_pixel * pixels * max(longer, math.sqrt(longer)))
     return min(max(wanted, MIN_BUDGET), MAX_BUDGET)
 
 

@@ -186,16 +186,25 @@ def test_few_views_shorten_a_run_and_many_never_do() -> None:
 
 
 def test_the_budget_follows_what_the_images_show_and_the_length_of_the_run() -> None:
-    assert plan.default_budget(50_000, 200, 7000) == 72_000
-    assert plan.default_budget(50_000, 200, 28_000) == 4 * plan.default_budget(50_000, 200, 7000)
-    assert plan.default_budget(50_000, 200, 1750) == 36_000
-    assert plan.default_budget(1, 200, 7000) == plan.MIN_BUDGET
-    assert plan.default_budget(1e9, 200, 7000) == plan.MAX_BUDGET
+    assert plan.default_budget(50_000, 200, 7000, 1.44) == 72_000
+    assert plan.default_budget(50_000, 200, 7000, 2.0) == 100_000
+    assert plan.default_budget(50_000, 200, 28_000, 1.44) == 4 * 72_000
+    assert plan.default_budget(50_000, 200, 1750, 1.44) == 36_000
+    assert plan.default_budget(1, 200, 7000, 1.44) == plan.MIN_BUDGET
+    assert plan.default_budget(1e9, 200, 7000, 1.44) == plan.MAX_BUDGET
 
 
 def test_in_a_longer_run_every_gaussian_has_thirty_pixels_of_the_views() -> None:
-    assert plan.default_budget(50_000, 60, 28_000) == 60 * 50_000 / 30
-    assert plan.default_budget(50_000, 1, 28_000) == plan.default_budget(50_000, 43, 28_000) == 72_000
+    assert plan.default_budget(50_000, 60, 28_000, 1.44) == plan.default_budget(50_000, 60, 28_000, 1.6) == 100_000
+    assert plan.default_budget(50_000, 1, 28_000, 1.44) == plan.default_budget(50_000, 43, 28_000, 1.44) == 72_000
+
+
+def test_the_shorter_run_with_few_views_of_an_object_learns_no_fewer_gaussians() -> None:
+    budgets = [
+        plan.default_budget(50_000, 8, 8 * few.steps_per_view, few.gaussians_per_pixel)
+        for few in (FEW_OF_A_SCENE, FEW_OF_AN_OBJECT)
+    ]
+    assert budgets[1] == pytest.approx(budgets[0], rel=0.01)
 
 
 def test_coarse_steps_are_shares_of_the_run_unless_given() -> None:

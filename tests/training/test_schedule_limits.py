@@ -79,7 +79,7 @@ def test_the_default_budget_grows_with_pixels_and_steps_within_its_bounds(
     pixels: float, iterations: int, budget: int
 ) -> None:
     """Four times the steps use four times the Gaussians, a quarter of them half as many."""
-    assert plan.default_budget(pixels, 200, iterations) == budget
+    assert plan.default_budget(pixels, 200, iterations, 1.44) == budget
 
 
 @pytest.mark.parametrize(("strategy", "few", "turnover"), [("adc", False, 0.2), ("adc", True, 0.0), ("mcmc", False, 0)])
