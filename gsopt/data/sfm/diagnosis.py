@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -174,29 +174,53 @@ def wide_gaps(names: Sequence[str], viewmats: Float[np.ndarray, "C 4 4"]) -> lis
     ]
 
 
-def hinge(names: Sequence[str], shared: Int64[np.ndarray, "C C"]) -> list[str]:
-    """Two or more photos that share points with the rest (`shared`: how many each pair does) through one photo alone:
-    where that is off, all of them are, and their points do not show it."""
+def weak_links(names: Sequence[str], shared: Int64[np.ndarray, "C C"]) -> list[str]:
+    """Two or more photos whose place among the others hangs on little (`shared`: points of each pair): on one photo
+    that shares points with both sides, or on pairs that share few. Where that is off, all of them are, and their points
+    do not show it."""
     linked = shared >= MIN_COMMON_FEATURES
+    parts = sorted(_parts(linked, np.ones(len(names), dtype=bool)), key=np.sum, reverse=True)
+    if len(parts) < 2:
+        return _hinge(names, linked)
+    return [_apart(names, shared, part) for part in parts[1:] if part.sum() > 1]
+
+
+def _apart(names: Sequence[str], shared: Int64[np.ndarray, "C C"], part: Bool[np.ndarray, "C"]) -> str:
+    """Advice for a part of the photos that no pair joins well to the others."""
+    across = np.where(part[:, None] & ~part, shared, -1)
+    inside, outside = divmod(int(np.argmax(across)), len(names))
+    return (
+        f"{_chosen(names, part)} share few points with the other photos, at best {across.max()} ({names[inside]} with "
+        f"{names[outside]}): all of them may be off together. Add photos between {names[inside]} and {names[outside]}."
+    )
+
+
+def _hinge(names: Sequence[str], linked: Bool[np.ndarray, "C C"]) -> list[str]:
+    """Advice for two or more photos that one photo alone joins to the others."""
     everyone = np.ones(len(names), dtype=bool)
-    if len(names) == 0 or not _reached(linked, everyone).all():
-        return []
     hanging, at = np.zeros(len(names), dtype=bool), -1
     for i in range(len(names)):
-        others = everyone.copy()
-        others[i] = False
-        while others.any():
-            part = _reached(linked, others)
-            others &= ~part
+        for part in _parts(linked, everyone & (np.arange(len(names)) != i)):
             if hanging.sum() < part.sum() <= (len(names) - 1) // 2:
                 hanging, at = part, i
     if hanging.sum() < 2:  # the first and the last photo of an arc may have one neighbor
         return []
-    listed = _listed([name for name, hangs in zip(names, hanging, strict=True) if hangs])
     return [
-        f"{listed} share points with the other photos through {names[at]} alone: where its pose is off, theirs are. "
-        f"Add photos on both sides of {names[at]}."
+        f"{_chosen(names, hanging)} share points with the other photos through {names[at]} alone: where its pose is "
+        f"off, theirs are. Add photos on both sides of {names[at]}."
     ]
+
+
+def _parts(linked: Bool[np.ndarray, "C C"], among: Bool[np.ndarray, "C"]) -> Iterator[Bool[np.ndarray, "C"]]:
+    """The sets of photos among these that links join, directly or through others."""
+    while among.any():
+        part = _reached(linked, among)
+        among = among & ~part
+        yield part
+
+
+def _chosen(names: Sequence[str], chosen: Bool[np.ndarray, "C"]) -> str:
+    return _listed([name for name, named in zip(names, chosen, strict=True) if named])
 
 
 def _reached(linked: Bool[np.ndarray, "C C"], among: Bool[np.ndarray, "C"]) -> Bool[np.ndarray, "C"]:

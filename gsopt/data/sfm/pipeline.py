@@ -150,7 +150,7 @@ class _Run:
         report.advice += found.notes + diagnosis.split_groups(found.graph, mapped.names)
         names, viewmats = poses(mapped.reconstruction)
         report.advice += diagnosis.wide_gaps(names, viewmats)
-        report.advice += diagnosis.hinge(names, shared_points(mapped.reconstruction, names))
+        report.advice += diagnosis.weak_links(names, shared_points(mapped.reconstruction, names))
         return report
 
     def _placed(self, mapped: MappingResult, frames: list[PosedImage] | None) -> Similarity:

@@ -105,19 +105,34 @@ def sharing(groups: Sequence[str], count: int = 30) -> Int64[np.ndarray, "7 7"]:
 def test_photos_that_hang_on_one_other_photo_are_named() -> None:
     """The smaller side of the one photo is named; where a second photo joins it too, nothing is."""
     names = [f"{i}.jpg" for i in range(7)]
-    (advice,) = diagnosis.hinge(names, sharing(["01234", "456"]))
+    (advice,) = diagnosis.weak_links(names, sharing(["01234", "456"]))
     assert advice.startswith("5.jpg, 6.jpg share points with the other photos through 4.jpg alone")
     assert advice.endswith("Add photos on both sides of 4.jpg.")
-    (weakly,) = diagnosis.hinge(names, np.maximum(sharing(["01234", "456"]), sharing(["0123456"], 29)))
+    (weakly,) = diagnosis.weak_links(names, np.maximum(sharing(["01234", "456"]), sharing(["0123456"], 29)))
     assert weakly == advice
-    assert diagnosis.hinge(names, sharing(["01234", "456", "26"])) == []
-    assert diagnosis.hinge(names, sharing(["012345", "56"])) == []  # one photo at the end
-    assert diagnosis.hinge(names, sharing(["0123", "456"])) == []  # points are rare between all of them
-    assert diagnosis.hinge([], np.zeros((0, 0), dtype=np.int64)) == []
+    assert diagnosis.weak_links(names, sharing(["01234", "456", "26"])) == []
+    assert diagnosis.weak_links(names, sharing(["012345", "56"])) == []  # one photo at the end
+    assert diagnosis.weak_links([], np.zeros((0, 0), dtype=np.int64)) == []
+
+
+def test_photos_that_share_few_points_with_the_others_are_named() -> None:
+    """The smaller part is named, with the pair that joins it best; photos that share few with any are no part."""
+    names = [f"{i}.jpg" for i in range(7)]
+    (advice,) = diagnosis.weak_links(names, np.maximum(sharing(["0123", "456"]), sharing(["35"], 29)))
+    assert advice.startswith(
+        "4.jpg, 5.jpg, 6.jpg share few points with the other photos, at best 29 (5.jpg with 3.jpg)"
+    )
+    assert advice.endswith("Add photos between 5.jpg and 3.jpg.")
+    assert [text.partition(" share ")[0] for text in diagnosis.weak_links(names, sharing(["012", "34", "56"]))] == [
+        "3.jpg, 4.jpg",
+        "5.jpg, 6.jpg",
+    ]
+    assert diagnosis.weak_links(names, sharing(["01234"])) == []
+    assert diagnosis.weak_links(names, sharing(["0123456"], 29)) == []
 
 
 def test_of_several_photos_that_others_hang_on_the_one_that_carries_most_is_named() -> None:
-    (advice,) = diagnosis.hinge([str(i) for i in range(7)], sharing(["01", "12", "23", "34", "45", "56"]))
+    (advice,) = diagnosis.weak_links([str(i) for i in range(7)], sharing(["01", "12", "23", "34", "45", "56"]))
     assert advice.startswith("0, 1, 2 share points with the other photos through 3 alone")
 
 
