@@ -176,8 +176,8 @@ def wide_gaps(names: Sequence[str], viewmats: Float[np.ndarray, "C 4 4"]) -> lis
 
 def weak_links(names: Sequence[str], shared: Int64[np.ndarray, "C C"]) -> list[str]:
     """Two or more photos whose place among the others hangs on little (`shared`: points of each pair): on one photo
-    that shares points with both sides, or on pairs that share few. Where that is off, all of them are, and their points
-    do not show it."""
+    that shares points with both sides, or on pairs that share few. All of them may be off together, and their points do
+    not show it."""
     linked = shared >= MIN_COMMON_FEATURES
     parts = sorted(_parts(linked, np.ones(len(names), dtype=bool)), key=np.sum, reverse=True)
     if len(parts) < 2:
