@@ -87,7 +87,7 @@ def test_the_figures_of_a_reconstruction_and_all_advice_are_in_its_diagnosis(
     monkeypatch.setattr(pipeline.diagnosis, "split_groups", lambda graph, placed: [f"{len(placed)} in a group"])
     monkeypatch.setattr(pipeline.diagnosis, "wide_gaps", lambda names, viewmats: [f"{len(names)} with {viewmats}"])
     monkeypatch.setattr(pipeline, "shared_points", lambda found, names: len(names))
-    monkeypatch.setattr(pipeline.diagnosis, "hinge", lambda names, shared: [f"{len(names)} share {shared}"])
+    monkeypatch.setattr(pipeline.diagnosis, "weak_links", lambda names, shared: [f"{len(names)} share {shared}"])
     mapped = MappingResult(made, "global", [])
     found = FoundPoses(graph(CHAIN), mapped, "sift", ["note"])
     report = run(tmp_path, [])._diagnose([photo(name) for name in NAMES[:4]], [], found, mapped)
