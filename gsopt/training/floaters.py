@@ -1,12 +1,21 @@
-"""Finds Gaussians that hang alone in space by the distance to their neighbors (GaussianObject, Yang et al. 2024)."""
+"""Finds Gaussians that hang alone in space by the distance to their neighbors (GaussianObject, Yang et al. 2024).
+
+Thin parts lie as far from others, but nothing else covers their pixels: what would open a hole in a silhouette stays.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from gsopt.gaussians import Gaussians
+from gsopt.geometry.cameras import Cameras
+from gsopt.raster.backend import Backend
+from gsopt.training.density.contribution import openings
 
 # Neighbors are looked for among at most this many Gaussians: the estimate of the local density stays, the cost does
 # not grow with the square of N. The rows are in Morton order, so that an even stride is an even sample of space.
@@ -16,6 +25,21 @@ MIN_GAUSSIANS = 64
 MIN_RELATIVE_STD = 0.01
 """Smallest standard deviation, as a share of the mean: where all are alike, rounding alone makes no floater."""
 CHUNK = 1024
+MAX_OPENING = 0.05
+"""Largest mean fall of alpha, over what a Gaussian covers in silhouettes, for it to be a floater."""
+
+
+def floaters(
+    gaussians: Gaussians, sigmas: float, silhouettes: Sequence[Cameras], backend: Backend, *, antialiased: bool
+) -> Bool[Tensor, "N"]:
+    """True where a Gaussian is solitary and no silhouette needs it.
+
+    `silhouettes`: cameras of the input views, of an object; none of a scene, whose edge is open wherever photos end.
+    """
+    alone = solitary(gaussians.means, sigmas)
+    if not bool(alone.any()):
+        return alone
+    return alone & (openings(gaussians, alone, silhouettes, backend, antialiased=antialiased) <= MAX_OPENING)
 
 
 def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:

@@ -21,7 +21,7 @@ from gsopt.training.content_window import draws_whole
 from gsopt.training.density import at_least_one, make_density
 from gsopt.training.density.contribution import contributions, least
 from gsopt.training.exposure import Exposure
-from gsopt.training.floaters import solitary
+from gsopt.training.floaters import floaters
 from gsopt.training.frame_loss import frame_loss
 from gsopt.training.optimizer import OptimizedGaussians, adam_step
 from gsopt.training.plan import RunPlan
@@ -191,9 +191,7 @@ class Trainer:
         moved = refined is not self.model
         self.model = refined
         if self._schedule.prunes_floaters(self.step):
-            sigmas = self._schedule.floater_sigmas(self.step)
-            gaussians = self.model.gaussians
-            self._select(at_least_one(~solitary(gaussians.means, sigmas), gaussians.logit_opacities))
+            self._remove_floaters()
             moved = True
         if moved:
             self._select(morton_order(self.model.gaussians.means))
@@ -205,9 +203,19 @@ class Trainer:
         """Remove what adds least to the input views where nothing can grow for want of room."""
         density = self.plan.density
         if density.turnover > 0 and len(self.model) >= FULL * density.max_gaussians:
-            cameras = [view.camera.to(torch.float32) for view in self.scene.train]
-            values = contributions(self.model.gaussians, cameras, self.backend, antialiased=self.plan.antialiased)
+            gaussians = self.model.gaussians
+            values = contributions(gaussians, self._cameras(), self.backend, antialiased=self.plan.antialiased)
             self._select(~least(values, density.turnover))
+
+    def _remove_floaters(self) -> None:
+        gaussians, sigmas = self.model.gaussians, self._schedule.floater_sigmas(self.step)
+        silhouettes = self._cameras() if self.scene.has_alpha else []
+        found = floaters(gaussians, sigmas, silhouettes, self.backend, antialiased=self.plan.antialiased)
+        self._select(at_least_one(~found, gaussians.logit_opacities))
+
+    def _cameras(self) -> list[Cameras]:
+        """Those of the input views, as the rasterizer takes them."""
+        return [view.camera.to(torch.float32) for view in self.scene.train]
 
     def _select(self, rows: Tensor) -> None:
         self.model = self.model.select(rows)

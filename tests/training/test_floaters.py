@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from tiny_scenes import cloud, ring
 
+from gsopt.gaussians import Gaussians
 from gsopt.geometry.morton import morton_order
+from gsopt.raster.api import make_backend
 from gsopt.training import floaters
 from gsopt.training.floaters import neighbor_distances, solitary
 
@@ -66,3 +71,43 @@ def test_where_nearly_all_are_alike_a_deviation_is_a_hundredth_of_the_mean(
     distances[5] = farthest
     monkeypatch.setattr(floaters, "neighbor_distances", lambda means: distances)
     assert solitary(torch.zeros(64, 3), sigmas=4.0).nonzero().flatten().tolist() == [5] * found
+
+
+@pytest.mark.parametrize(("opening", "removed"), [(0.0, True), (0.05, True), (0.0501, False)])
+def test_a_solitary_gaussian_that_an_input_view_needs_is_no_floater(
+    opening: float, removed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaussians = cloud(100, seed=2)
+    means = gaussians.means.clone()
+    means[7] = 50.0
+    gaussians = replace(gaussians, means=means)
+
+    def openings(given: Gaussians, alone: torch.Tensor, *views: object, antialiased: bool) -> torch.Tensor:
+        assert given is gaussians
+        assert alone.nonzero().flatten().tolist() == [7]
+        assert antialiased
+        return torch.where(alone, opening, 1.0)
+
+    monkeypatch.setattr(floaters, "openings", openings)
+    found = floaters.floaters(gaussians, 4.0, [], make_backend("cpu"), antialiased=True)
+    assert found.nonzero().flatten().tolist() == [7] * removed
+
+
+def test_a_rod_that_one_view_shows_stays_and_dust_before_a_ball_goes() -> None:
+    """Both lie as far from the ball: ten along a rod to its side, ten in a row before it."""
+    ball = 0.3 * torch.nn.functional.normalize(blob(500), dim=1)
+    camera = ring(1, 0.0)[0]
+    toward = torch.nn.functional.normalize(camera.centers[0].float(), dim=0)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(toward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+    far = torch.linspace(0.9, 1.2, 10)[:, None]
+    means = torch.cat([ball, far * aside, far * toward])
+    base = cloud(len(means), seed=1)
+    scales = torch.cat([torch.full((500, 3), 0.08), torch.full((10, 3), 0.05), torch.full((10, 3), 0.01)])
+    opaque = torch.full((len(means),), 4.0)
+    gaussians = replace(base, means=means, log_scales=scales.log(), logit_opacities=opaque)
+    alone = solitary(means, 2.0)
+    assert alone[500:].all()
+    assert not alone[:500].any()
+    found = floaters.floaters(gaussians, 2.0, [camera], make_backend("cpu"), antialiased=False)
+    assert not found[:510].any()
+    assert found[510:].all()

@@ -132,31 +132,50 @@ def test_a_view_rests_where_it_is_wanted_nobody_guides_and_the_set_is_settled(
     assert Trainer._rests(run, 3) == (wanted and settled and not guided)
 
 
-def change(refined: bool, floaters: bool, *, guided: bool = True, residual: bool = True, turns: bool = False) -> Any:
+def change(
+    refined: bool,
+    floaters: bool,
+    *,
+    guided: bool = True,
+    residual: bool = True,
+    turns: bool = False,
+    alpha: bool = True,
+) -> Any:
     """A run that changes its set of Gaussians in step 9, and all that it asked for."""
     old, new = (SimpleNamespace(gaussians=cloud(count, seed=count)) for count in (20, 25))
     log = Told(floater_sigmas=3.0, prunes_floaters=floaters, turns_over=turns)
     log._answers["refine"] = lambda step, model: new if refined else model
-    run = SimpleNamespace(plan=SimpleNamespace(residual_bands=residual), step=9, model=old, calls=log)
+    plan = SimpleNamespace(residual_bands=residual, antialiased=True)
+    run = SimpleNamespace(plan=plan, step=9, model=old, calls=log, backend=None)
     run._bands = run._schedule = run._density = log
     run._guidance = Told() if guided else None
     run._make_room = lambda: log.make_room()
+    run._cameras, run.scene = lambda: ["the input views' cameras"], SimpleNamespace(has_alpha=alpha)
+    run._remove_floaters = lambda: Trainer._remove_floaters(run)  # type: ignore[arg-type]
     run._select = lambda rows: log.select(rows)
     Trainer._change_set(run)
     run.expected = new if refined else old
     return run
 
 
+@pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize(("refined", "floaters"), [(False, False), (True, False), (False, True), (True, True)])
 def test_gaussians_are_put_in_order_after_every_change_of_their_set_and_only_then(
-    refined: bool, floaters: bool, monkeypatch: pytest.MonkeyPatch
+    refined: bool, floaters: bool, alpha: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was summed over the rows before is forgotten then, by the bands and by the guidance."""
     alone = torch.zeros(25 if refined else 20, dtype=torch.bool)
     alone[3] = True
     asked: list[float] = []
-    monkeypatch.setattr(parts, "solitary", lambda means, sigmas: (asked.append(sigmas), alone)[1])
-    run = change(refined, floaters)
+
+    def found(gaussians: Any, sigmas: float, silhouettes: Any, backend: Any, *, antialiased: bool) -> torch.Tensor:
+        assert silhouettes == ["the input views' cameras"] * alpha
+        assert antialiased
+        asked.append(sigmas)
+        return alone
+
+    monkeypatch.setattr(parts, "floaters", found)
+    run = change(refined, floaters, alpha=alpha)
     moved = refined or floaters
     selects = [rows for (rows,) in run.calls.named("select")]
     assert len(selects) == int(floaters) + int(moved)
@@ -198,6 +217,7 @@ def test_room_is_made_where_nineteen_twentieths_of_it_are_taken(
         _select=lambda rows: chosen.append(rows.tolist()),
     )
     run.model = type("Model", (), {"gaussians": None, "__len__": lambda self: count})()
+    run._cameras = lambda: Trainer._cameras(run)
     Trainer._make_room(run)
     assert chosen == ([[False, True]] if made_room else [])
     assert len(seen) == (len(scene.train) if made_room else 0)

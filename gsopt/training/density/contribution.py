@@ -1,4 +1,4 @@
-"""Measures what each Gaussian adds to the input views, and finds those that add least, to make room for growth.
+"""Measures what each Gaussian adds to the input views: what adds least makes room, what carries a silhouette stays.
 
 A budget that is full leaves density control nothing to grow with, although many Gaussians add next to nothing: they lie
 behind others, or cover less than a pixel (importance by the sum of blending weights: Fan et al. 2023, "LightGaussian").
@@ -27,15 +27,41 @@ def contributions(
 ) -> Float[Tensor, "N"]:
     """The sum of T alpha over the pixels of up to MAX_VIEWS cameras, px: dLoss/dcolor of a loss that adds up the pixels
     of one channel."""
-    count = min(MAX_VIEWS, len(cameras))
-    settings = RasterSettings(sh_degree=0, antialiased=antialiased)
-    gray = replace(gaussians, sh0=torch.zeros_like(gaussians.sh0))  # a black one, clamped, would have no gradient
+    settings, gray = RasterSettings(sh_degree=0, antialiased=antialiased), _gray(gaussians)
     total = torch.zeros_like(gaussians.logit_opacities)
-    for camera in (cameras[i * len(cameras) // count] for i in range(count)):
+    for camera in _spread(cameras):
         frame = backend.forward(gray, camera, settings)
         gradients = backend.backward(frame, torch.ones_like(frame.colors), bands=False)
         total += gradients.sh0[:, 0, 0] / C0
     return total
+
+
+def openings(
+    gaussians: Gaussians, removed: Bool[Tensor, "N"], cameras: Sequence[Cameras], backend: Backend, *, antialiased: bool
+) -> Float[Tensor, "N"]:
+    """The mean fall of alpha without `removed` over the pixels of each Gaussian, weighted by T alpha; 0 where it is
+    not seen."""
+    settings, gray = RasterSettings(sh_degree=0, antialiased=antialiased), _gray(gaussians)
+    others = gray.select(~removed)
+    added, opened = (torch.zeros_like(gaussians.logit_opacities) for _ in range(2))
+    for camera in _spread(cameras):
+        without = backend.forward(others, camera, settings).alphas
+        frame = backend.forward(gray, camera, settings)
+        fall = (frame.alphas - without).clamp_min(0)
+        gradients = backend.backward(frame, torch.stack([torch.ones_like(fall), fall, fall], -1), bands=False)
+        added += gradients.sh0[:, 0, 0]
+        opened += gradients.sh0[:, 0, 1]
+    return opened / added.clamp_min(torch.finfo(added.dtype).tiny)
+
+
+def _gray(gaussians: Gaussians) -> Gaussians:
+    """With one color, which is not black: that, clamped, would have no gradient."""
+    return replace(gaussians, sh0=torch.zeros_like(gaussians.sh0))
+
+
+def _spread(cameras: Sequence[Cameras]) -> list[Cameras]:
+    count = min(MAX_VIEWS, len(cameras))
+    return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
 def least(values: Float[Tensor, "N"], share: float) -> Bool[Tensor, "N"]:
