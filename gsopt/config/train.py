@@ -193,7 +193,8 @@ class SparseConfig:
     dropout: Annotated[float, Within(0, 0.95)] = 0.4
     """Share of Gaussians left out of the last step, rising linearly from 0 (DropGaussian, Park et al. 2025)."""
     floater_every: Count = 500
-    """Steps between two prunings by nearest-neighbor distance (GaussianObject, Yang et al. 2024); 0 = never."""
+    """Steps between two prunings by nearest-neighbor distance (GaussianObject, Yang et al. 2024), of an object with
+    masks only where no silhouette needs what goes; 0 = never."""
     lambda_opacity: Weight = 0.03
     """Weight that replaces the one of LossConfig where this is larger."""
     lambda_scale: Weight = 0.01

@@ -146,12 +146,12 @@ def change(
     log = Told(floater_sigmas=3.0, prunes_floaters=floaters, turns_over=turns)
     log._answers["refine"] = lambda step, model: new if refined else model
     plan = SimpleNamespace(residual_bands=residual, antialiased=True)
-    run = SimpleNamespace(plan=plan, step=9, model=old, calls=log, backend=None)
+    run: Any = SimpleNamespace(plan=plan, step=9, model=old, calls=log, backend=None)
     run._bands = run._schedule = run._density = log
     run._guidance = Told() if guided else None
     run._make_room = lambda: log.make_room()
     run._cameras, run.scene = lambda: ["the input views' cameras"], SimpleNamespace(has_alpha=alpha)
-    run._remove_floaters = lambda: Trainer._remove_floaters(run)  # type: ignore[arg-type]
+    run._remove_floaters = lambda: Trainer._remove_floaters(run)
     run._select = lambda rows: log.select(rows)
     Trainer._change_set(run)
     run.expected = new if refined else old
