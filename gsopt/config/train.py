@@ -197,12 +197,15 @@ class SparseConfig:
     masks only where no silhouette needs what goes; 0 = never."""
     lambda_opacity: Weight = 0.03
     """Weight that replaces the one of LossConfig where this is larger."""
-    lambda_scale: Weight = 0.01
-    """Weight that replaces the one of LossConfig where this is larger."""
+    lambda_scale: Weight = 0.04
+    """Weight of the mean scale of a scene without masks, over its extent; it replaces the one of LossConfig where this
+    is larger."""
+    lambda_area: Weight = 24.0
+    """Weight of the mean squared scale of an object with masks, over its squared extent: small splats cost less."""
     lambda_alpha: Weight = 0.5
     """Weight that replaces the one of LossConfig where this is larger."""
     lambda_unseen: Weight = 0.1
-    """Weight of a term that keeps an object with masks, shown by two to four photos, free of haze from other sides."""
+    """Weight of a term that keeps an object with masks free of haze as seen from other sides."""
     sh_degree: ShDegree = 2
     """Upper bound on the bands."""
     symmetry: Literal["auto", "off"] = "auto"

@@ -51,9 +51,10 @@ class LossWeights:
     alpha: float
     opacity: float
     scale: float
+    area: float
     depth: float
     unseen: float
-    """The term on views between few photos of a masked object."""
+    """The term on views between few photos of an object with masks."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class RunPlan:
             antialiased=config.antialiased,
             init=config.init,
             cell=config.cell,
-            weights=loss_weights(config, sparse, scene.has_alpha),
+            weights=loss_weights(config, sparse, scene.has_alpha, scene.extent),
             schedule=schedule,
             density=density_plan(config.density, budget, settings, scene.extent),
             poses=config.poses,
@@ -221,21 +222,25 @@ def refine_stop(config: DensityConfig, iterations: int) -> int:
     return min(published, round(share * iterations))
 
 
-def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool) -> LossWeights:
-    """The run's weights: LossConfig's (0.01 for mcmc's two, Kheradmand et al. 2024), or SparseConfig's if larger."""
+def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool, extent: float) -> LossWeights:
+    """The run's weights: LossConfig's (0.01 for mcmc's two, Kheradmand et al. 2024), or SparseConfig's if larger.
+
+    Large splats are weighed by their scale in a scene, whose background needs some, and by their area on an object
+    with masks (docs/decisions/0030-area.md)."""
     loss, few = config.loss, config.sparse
     default = 0.01 if config.density.strategy == "mcmc" else 0.0
     alpha = loss.lambda_alpha
     opacity = default if loss.lambda_opacity is None else loss.lambda_opacity
     scale = default if loss.lambda_scale is None else loss.lambda_scale
     if not sparse:
-        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, loss.lambda_depth, unseen=0.0)
-    raised = (
-        max(alpha, few.lambda_alpha),
-        max(opacity, few.lambda_opacity * (1 if has_alpha else OPAQUE_SHARE)),
-        max(scale, few.lambda_scale),
-    )
-    return LossWeights(loss.lambda_dssim, *raised, loss.lambda_depth, few.lambda_unseen)
+        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, 0.0, loss.lambda_depth, unseen=0.0)
+    alpha = max(alpha, few.lambda_alpha)
+    if has_alpha:
+        opacity, area = max(opacity, few.lambda_opacity), few.lambda_area / extent**2
+    else:
+        opacity, area = max(opacity, OPAQUE_SHARE * few.lambda_opacity), 0.0
+        scale = max(scale, few.lambda_scale / extent)
+    return LossWeights(loss.lambda_dssim, alpha, opacity, scale, area, loss.lambda_depth, few.lambda_unseen)
 
 
 def density_plan(config: DensityConfig, budget: int, settings: OpenSettings, extent: float) -> DensityPlan:

@@ -37,6 +37,11 @@ def add_scale_gradient(v_log_scales: Float[Tensor, "N 3"], log_scales: Float[Ten
     v_log_scales.add_(log_scales.exp(), alpha=weight / max(1, log_scales.numel()))
 
 
+def add_area_gradient(v_log_scales: Float[Tensor, "N 3"], log_scales: Float[Tensor, "N 3"], weight: float) -> None:
+    """Add d/dlog_scales of weight · mean(scales²): 2 weight/(3N) · scales², in place."""
+    v_log_scales.add_((2 * log_scales).exp(), alpha=2 * weight / max(1, log_scales.numel()))
+
+
 def weaken_near(gradients: Gradients, means: Float[Tensor, "N 3"], camera: Cameras, distance: float) -> None:
     """Scale the gradients of each Gaussian by min(1, (d / distance)²), d its distance to the camera, in place.
 

@@ -26,7 +26,13 @@ from gsopt.training.frame_loss import frame_loss
 from gsopt.training.optimizer import OptimizedGaussians, adam_step
 from gsopt.training.plan import RunPlan
 from gsopt.training.poses import PoseRefinement
-from gsopt.training.regularizers import Dropout, add_opacity_gradient, add_scale_gradient, weaken_near
+from gsopt.training.regularizers import (
+    Dropout,
+    add_area_gradient,
+    add_opacity_gradient,
+    add_scale_gradient,
+    weaken_near,
+)
 from gsopt.training.running_means import RunningMeans
 from gsopt.training.schedule import Flatness
 from gsopt.training.skipping import Bands, Resting
@@ -173,6 +179,8 @@ class Trainer:
             add_opacity_gradient(gradients.logit_opacities, gaussians.logit_opacities, weights.opacity)
         if weights.scale > 0:
             add_scale_gradient(gradients.log_scales, gaussians.log_scales, weights.scale)
+        if weights.area > 0:
+            add_area_gradient(gradients.log_scales, gaussians.log_scales, weights.area)
         return gradients
 
     def _update(self, gradients: Gradients, camera: Cameras, settings: RasterSettings) -> None:

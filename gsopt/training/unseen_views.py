@@ -1,7 +1,7 @@
 """Views between the photos, where no image says what shows: what is thin there is haze, and fades.
 
-Two to four photos agree with matter that none of them can tell from the object: it lies before or behind the object in
-each, half transparent, and other views show it as fog. The term asks of such views that every pixel show the object or
+Few photos agree with matter that none of them can tell from the object: it lies before or behind the object in each,
+half transparent, and other views show it as fog. The term asks of such views that every pixel show the object or
 nothing: weight · mean(a (2 m - a)) over their alphas a, with m = SOLID. Its gradient, 2 weight (m - a) / n, thins what
 is less opaque than m and closes what is more (docs/decisions/0017-unseen-views.md).
 """
@@ -21,8 +21,6 @@ from gsopt.geometry.focus import find_focus
 from gsopt.geometry.surrounding import surrounding_cameras
 from gsopt.raster.backend import Backend, Gradients, RasterSettings
 
-MAX_PHOTOS = 4
-"""Photos up to which the term pays."""
 SOLID = 0.8
 """Alpha above which a pixel shows the object: at 1 the term eats round things away, at 0.5 it hardens the haze."""
 COUNT = 16
@@ -50,10 +48,10 @@ class UnseenViews:
 
     @staticmethod
     def of(scene: Scene, weight: float, iterations: int) -> UnseenViews | None:
-        """The cameras, or None where the term has no weight or it is not few photos that look at one masked object."""
+        """The cameras, or None where the term has no weight or the photos do not look at one object with masks."""
         cameras = [view.camera for view in scene.train]
         focus = find_focus(cameras, scene.extent)
-        if weight == 0 or not scene.has_alpha or not focus.converging or len(cameras) > MAX_PHOTOS:
+        if weight == 0 or not scene.has_alpha or not focus.converging:
             return None
         lens = cameras[0].resized(*(max(1, extent // DOWNSCALE) for extent in (cameras[0].width, cameras[0].height)))
         return UnseenViews(surrounding_cameras(lens, focus.point, COUNT), weight, round(FROM_SHARE * iterations))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytest
@@ -19,7 +19,7 @@ from gsopt.training.targets import Target
 
 BACKEND = ReferenceBackend()
 GRAY = torch.tensor([0.3, 0.5, 0.7])
-WEIGHTS = LossWeights(dssim=0.2, alpha=0.0, opacity=0.0, scale=0.0, depth=0.1, unseen=0.0)
+WEIGHTS = LossWeights(dssim=0.2, alpha=0.0, opacity=0.0, scale=0.0, area=0.0, depth=0.1, unseen=0.0)
 
 
 @dataclass
@@ -70,7 +70,7 @@ def test_colors_count_by_the_weight_of_the_view_and_the_share_of_the_window() ->
 @pytest.mark.parametrize(("alpha", "weight", "counts"), [(True, 0.25, True), (True, 0.0, False), (False, 0.25, False)])
 def test_alphas_count_where_they_have_a_weight_and_the_photo_has_some(alpha: bool, weight: float, counts: bool) -> None:
     frame, target = drawn(), wanted(alpha=alpha, color=0.5, rows=12)
-    found = of(frame, target, LossWeights(0.2, weight, 0.0, 0.0, 0.1, 0.0)).v_alphas
+    found = of(frame, target, replace(WEIGHTS, alpha=weight)).v_alphas
     if counts:
         torch.testing.assert_close(found, alpha_gradient(frame.alphas, target.alphas, weight / 2))
     else:
@@ -84,7 +84,7 @@ def test_depths_count_where_the_photo_has_a_map_and_the_frame_has_depths() -> No
     assert through[0].any()
     torch.testing.assert_close(found.v_depths, through[0])
     torch.testing.assert_close(found.v_alphas, through[1])
-    with_alphas = of(frame, target, LossWeights(0.2, 0.25, 0.0, 0.0, 0.1, 0.0))
+    with_alphas = of(frame, target, replace(WEIGHTS, alpha=0.25))
     torch.testing.assert_close(with_alphas.v_alphas, through[1] + alpha_gradient(frame.alphas, target.alphas, 0.125))
     assert of(drawn(), target).v_depths is None
     assert of(frame, wanted()).v_depths is None

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsopt.training.regularizers import (
     ABSENT,
     Dropout,
+    add_area_gradient,
     add_opacity_gradient,
     add_scale_gradient,
     alpha_gradient,
@@ -28,6 +29,11 @@ def opacity_loss(logit_opacities: Tensor) -> Tensor:
 def scale_loss(log_scales: Tensor) -> Tensor:
     """Mean standard deviation over Gaussians and axes (Kheradmand et al. 2024, eq. 8); 0 for none."""
     return log_scales.exp().sum() / max(1, log_scales.numel())
+
+
+def area_loss(log_scales: Tensor) -> Tensor:
+    """Mean variance over Gaussians and axes; 0 for none."""
+    return (2 * log_scales).exp().sum() / max(1, log_scales.numel())
 
 
 def alpha_loss(alphas: Tensor, target: Tensor) -> Tensor:
@@ -50,6 +56,7 @@ def test_the_terms_are_means_of_the_activated_values() -> None:
     logits = torch.tensor([0.0, math.log(3.0)])
     assert float(opacity_loss(logits)) == pytest.approx((0.5 + 0.75) / 2)
     assert float(scale_loss(torch.tensor([[1.0, 2.0, 6.0]]).log())) == pytest.approx(3.0)
+    assert float(area_loss(torch.tensor([[1.0, 2.0, 5.0]]).log())) == pytest.approx(10.0)
     target = torch.rand(5, 7, generator=torch.Generator().manual_seed(2))
     assert float(alpha_loss(target, target)) == 0
     assert float(alpha_loss(target - 0.125, target)) == pytest.approx(0.125)
@@ -68,6 +75,12 @@ def test_scale_term(gaussians) -> None:
     torch.testing.assert_close(gradient, 1 + 0.3 * autograd(scale_loss, gaussians.log_scales), rtol=1e-12, atol=0)
 
 
+def test_area_term(gaussians) -> None:
+    gradient = torch.ones(COUNT, 3, dtype=torch.float64)
+    add_area_gradient(gradient, gaussians.log_scales, 0.3)
+    torch.testing.assert_close(gradient, 1 + 0.3 * autograd(area_loss, gaussians.log_scales), rtol=1e-12, atol=0)
+
+
 def test_alpha_term() -> None:
     generator = torch.Generator().manual_seed(1)
     alphas, target = torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
@@ -80,14 +93,17 @@ def test_terms_of_a_single_gaussian() -> None:
     add_opacity_gradient(opacity, torch.zeros(1), 1.0)
     add_scale_gradient(scale, torch.zeros(1, 3), 1.0)
     assert (opacity.tolist(), scale.tolist()) == ([0.25], [[pytest.approx(1 / 3)] * 3])
+    add_area_gradient(scale, torch.zeros(1, 3), 1.0)
+    assert scale.tolist() == [[pytest.approx(1 / 3 + 2 / 3)] * 3]
 
 
 def test_terms_of_an_empty_scene_are_empty() -> None:
     opacities, scales = torch.empty(0), torch.empty(0, 3)
     add_opacity_gradient(opacities, torch.empty(0), 1.0)
     add_scale_gradient(scales, torch.empty(0, 3), 1.0)
+    add_area_gradient(scales, torch.empty(0, 3), 1.0)
     assert (opacities.shape, scales.shape) == ((0,), (0, 3))
-    assert float(opacity_loss(opacities)) == 0 == float(scale_loss(scales))
+    assert float(opacity_loss(opacities)) == 0 == float(scale_loss(scales)) == float(area_loss(scales))
 
 
 def test_dropout_keeps_the_mean_opacity_and_the_rest_of_the_record(gaussians) -> None:

@@ -56,7 +56,7 @@ CHANGES: dict[str, dict[str, Any]] = {
         "sparse.dropout": 0.0,
         "sparse.floater_every": 5,
         "sparse.lambda_opacity": 0.3,
-        "sparse.lambda_scale": 0.3,
+        "sparse.lambda_area": 300.0,
         "sparse.lambda_alpha": 0.0,
         "sparse.sh_degree": 0,
         "sparse.below_views": 3,

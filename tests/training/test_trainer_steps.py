@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -346,13 +347,15 @@ def test_a_resumed_trainer_has_all_that_the_next_step_depends_on(scene: Scene) -
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("opacity", "scale"), [(0.0, 0.0), (0.01, 0.0), (0.0, 0.02), (0.01, 0.02)])
+@pytest.mark.parametrize("weights", list(itertools.product([0.0, 0.01], [0.0, 0.02], [0.0, 0.03])))
 def test_haze_and_size_are_weighed_by_their_own_weights(
-    scene: Scene, opacity: float, scale: float, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, weights: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trainer, asked = made(scene), dict[str, float]()
     monkeypatch.setattr(parts, "add_opacity_gradient", lambda v, logits, weight: asked.update(opacity=weight))
     monkeypatch.setattr(parts, "add_scale_gradient", lambda v, logs, weight: asked.update(scale=weight))
-    trainer.plan = replace(trainer.plan, weights=replace(trainer.plan.weights, opacity=opacity, scale=scale))
+    monkeypatch.setattr(parts, "add_area_gradient", lambda v, logs, weight: asked.update(area=weight))
+    given = dict(zip(("opacity", "scale", "area"), weights, strict=True))
+    trainer.plan = replace(trainer.plan, weights=replace(trainer.plan.weights, **given))
     trainer.advance()
-    assert asked == {name: weight for name, weight in (("opacity", opacity), ("scale", scale)) if weight}
+    assert asked == {name: weight for name, weight in given.items() if weight}

@@ -38,7 +38,7 @@ def scene(views: int, **fields: Any) -> Any:
 
 def test_haze_of_a_whole_scene_costs_a_sixth_of_what_it_costs_an_object() -> None:
     config = TrainConfig()
-    masked, whole = (plan.loss_weights(config, sparse=True, has_alpha=alpha) for alpha in (True, False))
+    masked, whole = (plan.loss_weights(config, sparse=True, has_alpha=alpha, extent=1.0) for alpha in (True, False))
     assert masked.opacity == pytest.approx(6 * whole.opacity)
     assert masked.opacity > 0
 

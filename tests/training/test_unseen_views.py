@@ -121,9 +121,8 @@ def test_the_photos_come_first_and_steps_between_are_free(scene: Scene, unseen: 
         assert not any(bool(getattr(gradients, name).any()) for name in NEEDED)
 
 
-def test_one_photo_many_photos_scenes_without_masks_and_a_weight_of_zero_do_without(scene: Scene) -> None:
-    assert UnseenViews.of(replace(scene, train=scene.train * 2), 0.1, STEPS) is not None
-    assert UnseenViews.of(replace(scene, train=scene.train * 2 + scene.train[:1]), 0.1, STEPS) is None
+def test_one_photo_scenes_without_masks_and_a_weight_of_zero_do_without(scene: Scene) -> None:
+    assert UnseenViews.of(replace(scene, train=scene.train * 8), 0.1, STEPS) is not None
     assert UnseenViews.of(scene, 0.0, STEPS) is None
     assert UnseenViews.of(replace(scene, train=scene.train[:1]), 0.1, STEPS) is None
     assert UnseenViews.of(replace(scene, has_alpha=False), 0.1, STEPS) is None
