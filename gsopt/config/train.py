@@ -204,7 +204,7 @@ class SparseConfig:
     """Weight of the mean squared scale of an object with masks, over its squared extent: small splats cost less."""
     lambda_alpha: Weight = 0.5
     """Weight that replaces the one of LossConfig where this is larger."""
-    lambda_unseen: Weight = 0.1
+    lambda_unseen: Weight = 0.2
     """Weight of a term that keeps an object with masks free of haze as seen from other sides."""
     sh_degree: ShDegree = 2
     """Upper bound on the bands."""

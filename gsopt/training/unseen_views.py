@@ -27,7 +27,7 @@ COUNT = 16
 """Number of cameras around the object."""
 TURN = 7
 """Cameras from one use to the next, so that neighbors do not follow each other; it shares no divisor with COUNT."""
-EVERY = 2
+EVERY = 4
 """Steps from one use to the next."""
 DOWNSCALE = 2
 """A photo's edge over that of their images: haze is wide."""
