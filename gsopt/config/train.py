@@ -197,9 +197,8 @@ class SparseConfig:
     masks only where no silhouette needs what goes; 0 = never."""
     lambda_opacity: Weight = 0.03
     """Weight that replaces the one of LossConfig where this is larger."""
-    lambda_scale: Weight = 0.04
-    """Weight of the mean scale of a scene without masks, over its extent; it replaces the one of LossConfig where this
-    is larger."""
+    lambda_scale: Weight = 0.01
+    """Weight that replaces the one of LossConfig where this is larger, in a scene without masks."""
     lambda_area: Weight = 24.0
     """Weight of the mean squared scale of an object with masks, over its squared extent: small splats cost less."""
     lambda_alpha: Weight = 0.5

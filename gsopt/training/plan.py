@@ -239,7 +239,7 @@ def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool, extent: flo
         opacity, area = max(opacity, few.lambda_opacity), few.lambda_area / extent**2
     else:
         opacity, area = max(opacity, OPAQUE_SHARE * few.lambda_opacity), 0.0
-        scale = max(scale, few.lambda_scale / extent)
+        scale = max(scale, few.lambda_scale)
     return LossWeights(loss.lambda_dssim, alpha, opacity, scale, area, loss.lambda_depth, few.lambda_unseen)
 
 

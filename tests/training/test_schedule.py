@@ -122,7 +122,7 @@ def test_few_views_raise_weights_and_lower_bands_but_never_the_other_way() -> No
     beside = {"dssim": 0.2, "alpha": 0.5, "depth": 0.1, "unseen": sparse.lambda_unseen}
     assert few == LossWeights(**beside, opacity=sparse.lambda_opacity, scale=0.0, area=sparse.lambda_area / 4)
     haze = pytest.approx(sparse.lambda_opacity * plan.OPAQUE_SHARE)
-    assert photos == LossWeights(**beside, opacity=haze, scale=sparse.lambda_scale / 2, area=0.0)
+    assert photos == LossWeights(**beside, opacity=haze, scale=sparse.lambda_scale, area=0.0)
     assert [is_sparse(config.sparse, views) for views in (4, 5)] == [True, False]
     assert (made(config, views=4).max_sh_degree, made(config, views=5).max_sh_degree) == (1, 3)
 
