@@ -175,6 +175,8 @@ class DensityConfig:
     the second half of refinement, where the budget is full; 0 = never. By default 0.2, with few views 0."""
     reset_every: Count = 0
     """adc: steps between two opacity resets, none in the last 2000 steps; 0 = never."""
+    haze_every: Count = 500
+    """Steps between two removals of faint Gaussians right before a camera, in a scene without masks; 0 = never."""
     noise_lr: Weight = 5e5
     """mcmc: strength of the position noise."""
     growth: Annotated[float, Within(1, MAX_WEIGHT)] = 1.05

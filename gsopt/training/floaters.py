@@ -1,4 +1,4 @@
-"""Finds Gaussians that hang alone in space by the distance to their neighbors (GaussianObject, Yang et al. 2024).
+"""Finds Gaussians that hang in space: those far from their neighbors (GaussianObject, Yang et al. 2024), and haze.
 
 Thin parts lie as far from others, but nothing else covers their pixels: what would open a hole in a silhouette stays.
 """
@@ -25,6 +25,8 @@ MIN_GAUSSIANS = 64
 MIN_RELATIVE_STD = 0.01
 """Smallest standard deviation, as a share of the mean: where all are alike, rounding alone makes no floater."""
 CHUNK = 1024
+FAINT = 0.1
+"""Opacity below which a Gaussian right before a camera is haze."""
 MAX_OPENING = 0.05
 """Largest mean fall of alpha, over what a Gaussian covers in silhouettes, for it to be a floater."""
 
@@ -40,6 +42,17 @@ def floaters(
     if not bool(alone.any()):
         return alone
     return alone & (openings(gaussians, alone, silhouettes, backend, antialiased=antialiased) <= MAX_OPENING)
+
+
+def haze(gaussians: Gaussians, cameras: Sequence[Cameras], distance: float) -> Bool[Tensor, "N"]:
+    """True where a Gaussian is faint and nearer than `distance` to one of the cameras: it corrects the colors of that
+    one image, and hangs before whoever looks from beside it."""
+    found = gaussians.opacities < FAINT
+    means, near = gaussians.means[found], torch.zeros(int(found.sum()), dtype=torch.bool, device=found.device)
+    for camera in cameras:
+        near |= (means - camera.centers[0].to(means)).square().sum(1) < distance**2
+    found[found.clone()] = near
+    return found
 
 
 def solitary(means: Float[Tensor, "N 3"], sigmas: float) -> Bool[Tensor, "N"]:

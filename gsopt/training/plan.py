@@ -39,6 +39,8 @@ SETTLING_SHARE = 0.05
 OPAQUE_SHARE = 1 / 6
 # Distance to a camera below which gradients are weakened, over the distance to what the cameras look at.
 NEAR_SHARE = 1.5
+# The same share, below which what is faint is haze (docs/decisions/0031-haze.md).
+HAZE_SHARE = 0.25
 # Most memory for float targets, as a share of the decoded images': both hold the same views.
 TARGET_CACHE_SHARE = 0.5
 
@@ -85,6 +87,8 @@ class RunPlan:
     """True with few views of a whole scene, no masks: then the Gaussians of the last steps are averaged."""
     near_distance: float
     """Distance to a camera below which gradients are weakened, scene units; 0 = never."""
+    haze_distance: float
+    """Distance to a camera below which what is faint is removed, scene units; 0 = never."""
     background: Background
     antialiased: bool
     init: InitConfig
@@ -114,7 +118,7 @@ class RunPlan:
         settings = open_settings(config.sparse, views, masked=scene.has_alpha)
         sparse = settings.few
         iterations = shortened(config, settings, 2 * views if scene.completed else views)
-        background = Background.of(config.data, scene)
+        background, focus = Background.of(config.data, scene), focus_distance(scene)
         pixels = content_pixels(scene.train)
         budget = config.density.max_gaussians or default_budget(pixels, views, iterations, settings.gaussians_per_pixel)
         schedule = make_schedule(config, iterations, settings, scene.extent, pixels)
@@ -122,7 +126,8 @@ class RunPlan:
             seed=config.seed,
             sparse=sparse,
             opaque=sparse and not scene.has_alpha,
-            near_distance=near_distance(scene) if sparse and not scene.has_alpha else 0.0,
+            near_distance=NEAR_SHARE * focus if sparse else 0.0,
+            haze_distance=HAZE_SHARE * focus,
             background=background,
             antialiased=config.antialiased,
             init=config.init,
@@ -149,10 +154,11 @@ class RunPlan:
         return json.loads(json.dumps(asdict(self)))
 
 
-def near_distance(scene: Scene) -> float:
-    """NEAR_SHARE of the cameras' distance to what they all look at; 0 where they look at no one place."""
+def focus_distance(scene: Scene) -> float:
+    """The cameras' distance to what they all look at; 0 where they look at no one place, and where masks keep haze
+    away."""
     focus = find_focus([view.camera for view in scene.train], scene.extent)
-    return NEAR_SHARE * focus.distance if focus.converging else 0.0
+    return focus.distance if focus.converging and not scene.has_alpha else 0.0
 
 
 def guesses(config: TrainConfig, views: int) -> bool:
@@ -199,6 +205,7 @@ def make_schedule(
         reset_every=config.density.reset_every,
         max_dropout=config.sparse.dropout if few else 0.0,
         floater_every=config.sparse.floater_every if few else 0,
+        haze_every=config.density.haze_every,
     )
 
 

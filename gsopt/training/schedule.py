@@ -45,6 +45,8 @@ class Schedule:
     """Share of Gaussians left out of the last step."""
     floater_every: int
     """Steps between two prunings of floaters; 0 = never."""
+    haze_every: int
+    """Steps between two removals of haze; 0 = never."""
 
     @property
     def averages_after(self) -> int:
@@ -102,6 +104,10 @@ class Schedule:
     def prunes_floaters(self, step: int) -> bool:
         """True when floaters are removed after this step; never after the last, which would leave holes."""
         return self.floater_every > 0 and step % self.floater_every == 0 and step < self.iterations
+
+    def removes_haze(self, step: int, last: int) -> bool:
+        """True when haze is removed after this step of a run that ends with step `last`, and after that."""
+        return self.haze_every > 0 and (step % self.haze_every == 0 or step == last)
 
     def floater_sigmas(self, step: int) -> float:
         """Distance from the mean distance beyond which a Gaussian is a floater, in standard deviations.

@@ -21,7 +21,7 @@ from gsopt.training.content_window import draws_whole
 from gsopt.training.density import at_least_one, make_density
 from gsopt.training.density.contribution import contributions, least
 from gsopt.training.exposure import Exposure
-from gsopt.training.floaters import floaters
+from gsopt.training.floaters import floaters, haze
 from gsopt.training.frame_loss import frame_loss
 from gsopt.training.optimizer import OptimizedGaussians, adam_step
 from gsopt.training.plan import RunPlan
@@ -201,6 +201,9 @@ class Trainer:
         if self._schedule.prunes_floaters(self.step):
             self._remove_floaters()
             moved = True
+        if self.plan.haze_distance > 0 and self._schedule.removes_haze(self.step, self._last):
+            self._remove(haze(self.model.gaussians, self._cameras(), self.plan.haze_distance))
+            moved = True
         if moved:
             self._select(morton_order(self.model.gaussians.means))
             self._bands.forget()
@@ -219,7 +222,10 @@ class Trainer:
         gaussians, sigmas = self.model.gaussians, self._schedule.floater_sigmas(self.step)
         silhouettes = self._cameras() if self.scene.has_alpha else []
         found = floaters(gaussians, sigmas, silhouettes, self.backend, antialiased=self.plan.antialiased)
-        self._select(at_least_one(~found, gaussians.logit_opacities))
+        self._remove(found)
+
+    def _remove(self, found: Tensor) -> None:
+        self._select(at_least_one(~found, self.model.gaussians.logit_opacities))
 
     def _cameras(self) -> list[Cameras]:
         """Those of the input views, as the rasterizer takes them."""

@@ -93,6 +93,19 @@ def test_a_solitary_gaussian_that_an_input_view_needs_is_no_floater(
     assert found.nonzero().flatten().tolist() == [7] * removed
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_haze_is_what_is_faint_and_close_to_any_camera(count: int) -> None:
+    around = ring(count, 0.0)
+    cameras = [around[index] for index in range(count)]
+    last = cameras[-1].centers[0].float()
+    aside = torch.nn.functional.normalize(torch.tensor([0.3, -0.2, 0.9]), dim=0)
+    means = last + torch.tensor([[0.1], [0.49], [0.51], [0.1], [0.49]]) * aside
+    opacities = torch.tensor([0.05, 0.099, 0.05, 0.101, 0.9])
+    gaussians = replace(cloud(5, seed=1), means=means, logit_opacities=opacities.logit())
+    assert floaters.haze(gaussians, cameras, 0.5).tolist() == [True, True, False, False, False]
+    assert floaters.haze(gaussians, cameras, 0.2).tolist() == [True, False, False, False, False]
+
+
 def test_a_rod_that_one_view_shows_stays_and_dust_before_a_ball_goes() -> None:
     """Both lie as far from the ball: ten along a rod to its side, ten in a row before it."""
     ball = 0.3 * torch.nn.functional.normalize(blob(500), dim=1)

@@ -142,6 +142,14 @@ def test_dropout_rises_from_nothing_to_its_share_with_few_views_alone() -> None:
     assert made(config).dropout(100) == 0
 
 
+def test_haze_is_removed_now_and_then_and_after_the_last_step() -> None:
+    run = made(TrainConfig(iterations=12, density=DensityConfig(haze_every=5)))
+    assert [step for step in range(1, 13) if run.removes_haze(step, last=12)] == [5, 10, 12]
+    assert [step for step in range(1, 13) if run.removes_haze(step, last=7)] == [5, 7, 10]
+    never = made(TrainConfig(iterations=12, density=DensityConfig(haze_every=0)))
+    assert not any(never.removes_haze(step, last=12) for step in range(1, 13))
+
+
 def test_floaters_are_never_pruned_after_the_last_step_nor_with_many_views() -> None:
     config = TrainConfig(iterations=15, sparse=SparseConfig(floater_every=5))
     assert [step for step in range(1, 16) if made(config, views=4).prunes_floaters(step)] == [5, 10]

@@ -97,6 +97,7 @@ def test_gradients_weaken_near_cameras_and_gaussians_are_averaged_with_few_photo
     config = tiny_config(Path("unused"), sparse=SparseConfig(below_views=8 if few else 0, steps_per_view=0))
     found = RunPlan.of(config, replace(scene, has_alpha=alpha))
     assert found.opaque == (few and not alpha)
+    assert (found.haze_distance > 0) == (not alpha)
     assert (found.near_distance > 1) == (few and not alpha)
     assert (found.near_distance == 0) != (few and not alpha)
 

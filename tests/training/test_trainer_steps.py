@@ -141,18 +141,21 @@ def change(
     residual: bool = True,
     turns: bool = False,
     alpha: bool = True,
+    haze: bool = False,
+    distance: float = 0.5,
 ) -> Any:
     """A run that changes its set of Gaussians in step 9, and all that it asked for."""
     old, new = (SimpleNamespace(gaussians=cloud(count, seed=count)) for count in (20, 25))
-    log = Told(floater_sigmas=3.0, prunes_floaters=floaters, turns_over=turns)
+    log = Told(floater_sigmas=3.0, prunes_floaters=floaters, turns_over=turns, removes_haze=haze)
     log._answers["refine"] = lambda step, model: new if refined else model
-    plan = SimpleNamespace(residual_bands=residual, antialiased=True)
-    run: Any = SimpleNamespace(plan=plan, step=9, model=old, calls=log, backend=None)
+    plan = SimpleNamespace(residual_bands=residual, antialiased=True, haze_distance=distance)
+    run: Any = SimpleNamespace(plan=plan, step=9, _last=30, model=old, calls=log, backend=None)
     run._bands = run._schedule = run._density = log
     run._guidance = Told() if guided else None
     run._make_room = lambda: log.make_room()
     run._cameras, run.scene = lambda: ["the input views' cameras"], SimpleNamespace(has_alpha=alpha)
     run._remove_floaters = lambda: Trainer._remove_floaters(run)
+    run._remove = lambda found: Trainer._remove(run, found)
     run._select = lambda rows: log.select(rows)
     Trainer._change_set(run)
     run.expected = new if refined else old
@@ -187,6 +190,25 @@ def test_gaussians_are_put_in_order_after_every_change_of_their_set_and_only_the
         assert torch.equal(selects[-1], morton_order(run.expected.gaussians.means))
     assert len(run.calls.named("forget")) == len(run._guidance.named("forget")) == int(moved)
     assert run.model is run.expected
+
+
+@pytest.mark.parametrize(("due", "distance"), [(True, 0.5), (False, 0.5), (True, 0.0)])
+def test_haze_is_removed_where_it_is_due_and_cameras_look_at_one_place(
+    due: bool, distance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found(gaussians: Any, cameras: Any, near: float) -> torch.Tensor:
+        assert (cameras, near) == (["the input views' cameras"], distance)
+        return torch.arange(20) == 4
+
+    monkeypatch.setattr(parts, "haze", found)
+    run = change(False, False, haze=due, distance=distance)
+    selects = [rows for (rows,) in run.calls.named("select")]
+    if not (due and distance > 0):
+        assert selects == []
+        return
+    assert run.calls.named("removes_haze") == [(9, 30)]
+    assert torch.equal(selects[0], torch.arange(20) != 4)
+    assert torch.equal(selects[1], morton_order(run.expected.gaussians.means))
 
 
 def test_bands_decide_and_room_is_made_where_they_are_due() -> None:

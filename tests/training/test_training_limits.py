@@ -43,14 +43,15 @@ def test_haze_of_a_whole_scene_costs_a_sixth_of_what_it_costs_an_object() -> Non
     assert masked.opacity > 0
 
 
-def test_gradients_weaken_within_one_and_a_half_times_the_way_to_what_cameras_look_at() -> None:
-    assert plan.near_distance(scene(6)) == pytest.approx(1.5 * math.hypot(3, 1), rel=0.05)
+def test_what_cameras_look_at_has_a_distance_where_no_mask_keeps_haze_away() -> None:
+    assert plan.focus_distance(scene(6)) == pytest.approx(math.hypot(3, 1), rel=0.05)
+    assert plan.focus_distance(scene(6, has_alpha=True)) == 0.0
     apart = scene(6)
     for view in apart.train:
         back = view.camera.viewmats.clone()
         back[:, 1:3] *= -1  # turned about its own x axis: it looks away
         view.camera = replace(view.camera, viewmats=back)
-    assert plan.near_distance(apart) == 0.0
+    assert plan.focus_distance(apart) == 0.0
 
 
 @pytest.mark.parametrize(

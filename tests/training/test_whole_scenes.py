@@ -25,7 +25,7 @@ from gsopt.raster.reference import ReferenceBackend
 from gsopt.results.finished_run import background_of
 from gsopt.training.averaging import EVERY, RunningAverage
 from gsopt.training.loop import train
-from gsopt.training.plan import NEAR_SHARE, RunPlan, matches_photos
+from gsopt.training.plan import HAZE_SHARE, NEAR_SHARE, RunPlan, matches_photos
 from gsopt.training.regularizers import weaken_near
 
 
@@ -108,6 +108,8 @@ def test_only_few_photos_of_a_whole_scene_are_treated_so(dataset: Path) -> None:
     many = RunPlan.of(TrainConfig.of(sparse={"below_views": 2}), scene)
     for other in (masked, many):
         assert (other.opaque, other.near_distance) == (False, 0.0)
+    assert many.haze_distance == plan.haze_distance == pytest.approx(HAZE_SHARE * 10**0.5, rel=1e-3)
+    assert masked.haze_distance == 0
     assert plan.weights.opacity < masked.weights.opacity
     outward = tuple(
         replace(
@@ -116,7 +118,8 @@ def test_only_few_photos_of_a_whole_scene_are_treated_so(dataset: Path) -> None:
         )
         for view in scene.train
     )
-    assert RunPlan.of(config, replace(scene, train=outward)).near_distance == 0, "no place that all look at"
+    apart = RunPlan.of(config, replace(scene, train=outward))
+    assert apart.near_distance == apart.haze_distance == 0, "no place that all look at"
 
 
 def test_behind_a_scene_lies_its_mean_color_and_behind_an_object_white(dataset: Path, tmp_path: Path) -> None:

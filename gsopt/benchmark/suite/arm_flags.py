@@ -24,6 +24,7 @@ PUBLISHED_SETTINGS = (
     *("--density.grow-grad2d", "2e-4"),
     *("--density.turnover", "0"),
     *("--density.reset-every", "3000"),
+    *("--density.haze-every", "0"),
     "--schedule.coarse-until",
     *("--max-gaussians", "1000000"),
 )
