@@ -6,11 +6,14 @@
 // neighbors are three floats apart. The gradient of SSIM is again a filtered image, five rows later: what it is made of
 // waits for it in a ring of rows that stays in the cache. Each row of a strip has its own sum, and these are added in
 // double in one order: the same bits for any number of threads.
+//
+// What no window reaches from a pixel in which the images differ has SSIM 1 and no gradient, and is left out.
 #pragma once
 #include "../common/ssim.h"
 #include "frame.h"
 #include "parallel.h"
 #include "simd.h"
+#include "intervals.h"
 
 namespace gsopt::GSOPT_ISA {
 
@@ -64,13 +67,17 @@ template <int Maps> class Columns {
  public:
   explicit Columns(const Band& band) : b(band), first(b.grown().x0), end(first + b.grown().n) {}
 
-  // `combine(inputs, values)` makes the inputs of the maps from those of the images.
-  template <int Images, class Combine> void fill(int y, const Image (&images)[Images], Combine&& combine) {
+  // What `filter` needs for the floats `part` of the rows. `combine(inputs, values)` makes the inputs of the maps from
+  // those of the images.
+  template <int Images, class Combine>
+  void fill(int y, Interval part, const Image (&images)[Images], Combine&& combine) {
+    if (part.empty()) return;
     const int n = end - first < kWide ? kWide : end - first;
     const float* rows[Images][kTaps + 1];
     for (int m = 0; m < Images; ++m)
       for (int k = 0; k <= kTaps; ++k) rows[m][k] = row_of(images[m], y - kRadius + k, narrow[m][k]);
-    for (int i = 0; i < n; i += kWide) {
+    const int left = std::max(0, part.begin - kHalo - first) / kWide * kWide, right = part.end + kHalo - first;
+    for (int i = left; i < std::min(n, right); i += kWide) {
       const int at = i + kWide <= n ? i : n - kWide;  // the last vector overlaps its neighbor
       wide sum[2][Maps] = {};
 #pragma GCC unroll 12
@@ -139,10 +146,12 @@ inline double total(wide v) {
   return sum;
 }
 
-// Two rows of SSIM's partials from y on, into three maps; SSIM itself is summed over rows and floats of `inner`.
-inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&images)[2], const Image (&maps)[3],
-    const Band& inner, double* row_ssim) {
-  columns.fill(y, images, [](const wide* in, wide* value) {
+// Two rows of SSIM's partials from y on, of the floats `part`, into three maps; SSIM itself, which is 1 elsewhere, is
+// summed over rows and floats of `inner`.
+inline void ssim_rows(Columns<4>& columns, const Band& b, int y, Interval part, const Image (&images)[2],
+    const Image (&maps)[3], const Band& inner, double* row_ssim) {
+  const Interval counted = part.clipped(inner.x0, inner.x0 + inner.n);
+  columns.fill(y, part, images, [](const wide* in, wide* value) {
     const wide x = in[0], target = in[1];
     value[0] = x;
     value[1] = target;
@@ -152,7 +161,7 @@ inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&i
   for (int r = 0; r < 2 && y + r < b.y1; ++r) {
     float *mean = maps[0].at(y + r, b.x0), *square = maps[1].at(y + r, b.x0), *product = maps[2].at(y + r, b.x0);
     alignas(64) float ssim[kStrip + 2 * kHalo + kWide];
-    for (int i = 0; i < b.n; i += kWide) {
+    for (int i = part.begin - b.x0; i < part.end - b.x0; i += kWide) {
       wide d[3];
       store_wide(ssim + i, ssim_partials(columns.filter(r, 0, i), columns.filter(r, 1, i), columns.filter(r, 2, i),
                                columns.filter(r, 3, i), d[0], d[1], d[2]));
@@ -162,27 +171,29 @@ inline void ssim_rows(Columns<4>& columns, const Band& b, int y, const Image (&i
     }
     if (y + r < inner.y0 || y + r >= inner.y1) continue;
     wide sum = splat<wide>(0.f);
-    const float* of_inner = ssim + (inner.x0 - b.x0);
-    for (int i = 0; i < inner.n; i += kWide) sum += load_first(of_inner + i, inner.n - i);
-    row_ssim[y + r] = total(sum);
+    for (int i = counted.begin; i < counted.end; i += kWide) sum += load_first(ssim + i - b.x0, counted.end - i);
+    row_ssim[y + r] = total(sum) + inner.n - counted.length();
   }
 }
 
-// Two rows of the gradient from y on. The window is symmetric, so its transpose is itself:
+// Two rows of the gradient from y on, 0 outside `part`. The window is symmetric, so its transpose is itself:
 // v = F(d_mean) + 2 x F(d_square) + y F(d_product), (21).
-inline void gradient_rows(
-    Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y, const Image (&maps)[3], double* row_l1) {
+inline void gradient_rows(Columns<3>& columns, const PhotometricArguments& a, const Band& b, int y, Interval part,
+    const Image (&maps)[3], double* row_l1) {
   const double count = static_cast<double>(b.width) * b.height;
   const wide w_l1 = splat<wide>(static_cast<float>((1.0 - a.lambda_dssim) / count)),
              w_ssim = splat<wide>(static_cast<float>(-a.lambda_dssim / count));
   const wide zero = splat<wide>(0.f);
-  columns.fill(y, maps, [](const wide* in, wide* value) {
+  columns.fill(y, part, maps, [](const wide* in, wide* value) {
     for (int m = 0; m < 3; ++m) value[m] = in[m];
   });
   for (int r = 0; r < 2 && y + r < b.y1; ++r) {
     const int64_t at = static_cast<int64_t>(y + r) * b.width + b.x0;
+    const int begin = part.begin - b.x0, end = part.end - b.x0;
+    std::memset(a.v_rendered + at, 0, sizeof(float) * begin);
+    std::memset(a.v_rendered + at + end, 0, sizeof(float) * (b.n - end));
     wide sum = zero;
-    for (int i = 0; i < b.n; i += kWide) {
+    for (int i = begin; i < end; i += kWide) {
       const wide x = load_first(a.rendered + at + i, b.n - i), target = load_first(a.target + at + i, b.n - i),
                  difference = x - target;
       sum += first_of(abs(difference), b.n - i);
@@ -194,9 +205,23 @@ inline void gradient_rows(
   }
 }
 
+// Where a strip has a gradient in two rows from an even y on: whole vectors. `near`: that of every pair of whole rows.
+inline Interval with_gradient(const Band& b, const Interval* near, int y) {
+  return near[y / 2].clipped(b.x0, b.x0 + b.n).of_vectors(b.x0, b.x0 + b.n);
+}
+
+// Where such a gradient needs the partials of two rows from y on, in the strip and what lies `around` it.
+inline Interval with_partials(const Band& b, const Band& around, const Interval* near, int y) {
+  Interval all;
+  for (int from = std::max(0, y - kRadius - 1); from < std::min(b.height, y + kRadius + 2); from += 2)
+    all = all.joined(with_gradient(b, near, from));
+  const int end = around.x0 + around.n;
+  return all.grown(kHalo).clipped(around.x0, end).of_vectors(around.x0, end);
+}
+
 // The partials run ahead of the gradient by the rows that its window reaches.
 inline void photometric_band(
-    const PhotometricArguments& a, const Band& b, float* ring, double* row_ssim, double* row_l1) {
+    const PhotometricArguments& a, const Band& b, const Interval* near, float* ring, double* row_ssim, double* row_l1) {
   const Band around = b.grown();
   const int64_t stride = kRingStride;
   const Image images[2] = {
@@ -208,8 +233,8 @@ inline void photometric_band(
   int next = around.y0;
   for (int y = b.y0; y < b.y1; y += 2) {
     for (; next < around.y1 && next <= y + 1 + kRadius; next += 2)
-      ssim_rows(ahead, around, next, images, maps, b, row_ssim);
-    gradient_rows(columns, a, b, y, maps, row_l1);
+      ssim_rows(ahead, around, next, with_partials(b, around, near, next), images, maps, b, row_ssim);
+    gradient_rows(columns, a, b, y, with_gradient(b, near, y), maps, row_l1);
   }
 }
 
@@ -219,15 +244,24 @@ inline void photometric_stage(Pool& pool, PhotometricArguments& a) {
   const int bands = pool.threads() == 1 ? 1 : 2 * pool.threads();
   const int rows = (a.height + 2 * bands - 1) / (2 * bands) * 2;  // even, so that no pair of rows is split
   constexpr int64_t kRingFloats = 3 * kRing * kRingStride;
-  a.scratch->reserve(sizeof(float) * kRingFloats * pool.threads() + sizeof(double) * 2 * strips * a.height);
+  const int pairs = divide_up(a.height, 2);
+  a.scratch->reserve(sizeof(float) * kRingFloats * pool.threads() + sizeof(double) * 2 * strips * a.height +
+                     sizeof(Interval) * 2 * pairs);
   double *ssim = reinterpret_cast<double*>(a.scratch->as<float>() + kRingFloats * pool.threads()),
          *l1 = ssim + static_cast<int64_t>(strips) * a.height;
+  Interval *differ = reinterpret_cast<Interval*>(l1 + static_cast<int64_t>(strips) * a.height), *near = differ + pairs;
+  parallel(pool, bands, [&](int item, int) {
+    for (int y = item * rows; y < std::min(a.height, (item + 1) * rows); y += 2)
+      differ[y / 2] = differing_rows(a.rendered, a.target, y, std::min(y + 2, a.height), width);
+  });
+  reached(differ, near, pairs, kRadius, 2 * kHalo, width);
   parallel(pool, bands * strips, [&](int item, int worker) {
     const int x0 = item % strips * strip, y0 = item / strips * rows;
     const Band band = {
         y0, y0 + rows < a.height ? y0 + rows : a.height, x0, width - x0 < strip ? width - x0 : strip, width, a.height};
     const int64_t sums = static_cast<int64_t>(item % strips) * a.height;
-    if (y0 < a.height) photometric_band(a, band, a.scratch->as<float>() + kRingFloats * worker, ssim + sums, l1 + sums);
+    float* ring = a.scratch->as<float>() + kRingFloats * worker;
+    if (y0 < a.height) photometric_band(a, band, near, ring, ssim + sums, l1 + sums);
   });
   a.ssim = a.l1 = 0;
   for (int64_t k = 0; k < static_cast<int64_t>(strips) * a.height; ++k) {
