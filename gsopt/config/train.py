@@ -109,8 +109,8 @@ class OptimizerConfig:
     lr_shN: Weight | None = None
     """Learning rate of the view-dependent color; by default 5e-4, with few views 2.5e-4."""
     lr_last: Annotated[float, Within(1e-6, 1)] = 0.1
-    """Share of every rate at the last step: rates fall to it over the last 5 % of a run, except with few views; 1 keeps
-    them."""
+    """Share of every rate at the last step: rates fall to it over the last 5 % of a run, with few views over the last
+    10 % for an object with masks, never for a whole scene; 1 keeps them."""
     beta1: Decay = 0.9
     """Decay of Adam's mean gradient."""
     beta2: Decay = 0.999

@@ -1,7 +1,7 @@
 """The mean of the Gaussians over the last steps of a run (Polyak & Juditsky 1992; Izmailov et al. 2018).
 
-With few photos the learning rates never fall, since their noise keeps a run from fitting single photos too well; the
-mean over the last steps keeps that and loses the noise of the last one.
+With few photos of a whole scene the learning rates never fall, since their noise keeps a run from fitting single photos
+too well; the mean over the last steps keeps that and loses the noise of the last one.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ Few views are learned more slowly, and nothing makes room for what they show bet
 need (docs/decisions/0019-fewer-steps.md). Early steps only move coarse shapes, so that a run begins with small images;
 few photos of a whole scene keep them longer, lest fine detail is learned as view-dependent fog. Masks keep fog away:
 few views of an object need neither long coarse steps nor many, and small images lose what little they show
-(docs/decisions/0028-small-objects.md).
+(docs/decisions/0028-small-objects.md). Rates fall at the end, but not where few photos show a whole scene
+(docs/decisions/0032-settling.md).
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ class OpenSettings:
     gaussians_per_pixel: float
     """Default budget of 7000 steps, per pixel of an image that shows something."""
     coarse_shares: tuple[float, ...]
-    """Shares of the run drawn at a quarter and at half of the resolution."""
+    """Shares of the run after which the resolution is half and full; before, it is a quarter."""
+    settling_share: float
+    """Share of the run, its last, in which all rates fall, so that it does not end in the noise of single steps."""
     least_content: int
     """Fewest pixels that show something, mean over the photos, in an image smaller than a photo."""
 
@@ -60,6 +63,7 @@ MANY = OpenSettings(
     steps_per_view=0,
     gaussians_per_pixel=1.44,
     coarse_shares=(0.06, 0.23),
+    settling_share=0.05,
     least_content=0,
 )
 FEW_OF_A_SCENE = OpenSettings(
@@ -75,6 +79,7 @@ FEW_OF_A_SCENE = OpenSettings(
     steps_per_view=500,
     gaussians_per_pixel=1.44,
     coarse_shares=(1 / 6, 1 / 2),
+    settling_share=0.0,
     least_content=0,
 )
 FEW_OF_AN_OBJECT = replace(
@@ -83,6 +88,7 @@ FEW_OF_AN_OBJECT = replace(
     steps_per_view=350,
     gaussians_per_pixel=1.72,
     coarse_shares=MANY.coarse_shares,
+    settling_share=0.1,
     least_content=4000,
 )
 

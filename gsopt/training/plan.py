@@ -33,8 +33,6 @@ MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
 # Mirror images drawn per epoch, times the number of photos: the more photos there are, the less they leave open and the
 # more the images blur what the photos show (docs/decisions/0002-symmetry.md).
 MIRRORED_TIMES_VIEWS = 32
-# Share of a run in which the rates fall, so that it does not end in the noise of the last few views it drew.
-SETTLING_SHARE = 0.05
 # Share of SparseConfig's lambda_opacity without masks: in a scene nothing is transparent, and faded splats are haze.
 OPAQUE_SHARE = 1 / 6
 # Distance to a camera below which gradients are weakened, over the distance to what the cameras look at.
@@ -185,8 +183,7 @@ def make_schedule(
 ) -> Schedule:
     """The schedule of a run of so many steps, whose images have so many pixels that show something.
 
-    No rate falls at the end with few views, where the noise of single steps acts as a regularizer against overfitting
-    (docs/decisions/0001-schedule.md); few views cannot tell view dependence from shape, so that they get fewer bands.
+    Few views cannot tell view dependence from shape, so that they get fewer bands.
     """
     density, optimizer, few = settings.growth(config.density), settings.of(config.optimizer), settings.few
     degree = config.optimizer.sh_degree
@@ -196,7 +193,7 @@ def make_schedule(
         optimizer=replace(config.optimizer, **optimizer),
         lr_means_first=optimizer["lr_means"],
         sh_degree_every=optimizer["sh_degree_every"],
-        settling=0 if few else math.ceil(SETTLING_SHARE * iterations),
+        settling=math.ceil(settings.settling_share * iterations),
         coarse_until=coarse_until(config.schedule.coarse_until, settings, iterations, pixels),
         max_sh_degree=min(degree, config.sparse.sh_degree) if few else degree,
         refine_start=density["refine_start"],

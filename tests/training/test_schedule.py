@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 
 from gsopt.config.train import DensityConfig, LossConfig, OptimizerConfig, ScheduleConfig, SparseConfig, TrainConfig
 from gsopt.training import plan, schedule
-from gsopt.training.open_settings import FEW_OF_A_SCENE, FEW_OF_AN_OBJECT, MANY, is_sparse, open_settings
+from gsopt.training.open_settings import (
+    FEW_OF_A_SCENE,
+    FEW_OF_AN_OBJECT,
+    MANY,
+    is_sparse,
+    open_settings,
+)
 from gsopt.training.plan import LossWeights
 from gsopt.training.schedule import Flatness, Schedule
 
@@ -172,7 +178,7 @@ def test_a_noisy_plateau_is_flat() -> None:
     )
 
 
-def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
+def test_rates_fall_at_the_end_but_not_with_few_views_of_a_scene() -> None:
     config = TrainConfig(iterations=1000)
     run = made(config)
     assert run.settling == 50
@@ -180,7 +186,9 @@ def test_rates_fall_at_the_end_but_not_with_few_views() -> None:
     assert set(shares[:950]) == {1.0}
     assert all(a > b for a, b in itertools.pairwise(shares[949:]))
     assert shares[-1] == pytest.approx(config.optimizer.lr_last)
-    assert made(config, views=config.sparse.below_views).lr_share(1000, 1000) == 1.0
+    few = config.sparse.below_views
+    assert made(config, views=few, masked=True).settling == 100
+    assert {made(config, views=few).lr_share(step, 1000) for step in range(1, 1001)} == {1.0}
 
 
 def test_few_views_shorten_a_run_and_many_never_do() -> None:
