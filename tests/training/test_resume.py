@@ -312,9 +312,11 @@ def test_early_end_is_remembered(dataset: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Flatness, "update", lambda self, loss: True)
     config = replace(configs(dataset)["coarse to fine"], optimizer=replace(tiny_config(dataset).optimizer, sh_degree=0))
     first = train(config, tmp_path / "run")
-    ending = RunPlan.of(config, load_scene(config.data)).schedule
-    assert first.steps == ending.refine_stop + 1 + ending.settling
-    assert ending.settling > 0
+    settling = RunPlan.of(config, load_scene(config.data)).schedule.settling
+    assert settling > 0
+    assert first.steps == 26 + settling  # the first step after refine_stop
     assert not first.stopped
     again = train(config, tmp_path / "run", resume=True)
     assert again.steps == first.steps
+    many = replace(config, sparse=replace(config.sparse, below_views=0))
+    assert train(many, tmp_path / "many").steps == 26 + RunPlan.of(many, load_scene(many.data)).schedule.settling

@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 
 from gsopt.config.train import DensityConfig, LossConfig, OptimizerConfig, ScheduleConfig, SparseConfig, TrainConfig
 from gsopt.training import plan, schedule
-from gsopt.training.open_settings import (
-    FEW_OF_A_SCENE,
-    FEW_OF_AN_OBJECT,
-    MANY,
-    is_sparse,
-    open_settings,
-)
+from gsopt.training.open_settings import FEW_OF_A_SCENE, FEW_OF_AN_OBJECT, MANY, is_sparse, open_settings
 from gsopt.training.plan import LossWeights
 from gsopt.training.schedule import Flatness, Schedule
 
