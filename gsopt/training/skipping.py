@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from gsopt.gaussians import Gaussians
@@ -22,26 +21,26 @@ class Resting:
     LEAST_GAIN = 0.01
 
     def __init__(self, views: int) -> None:
-        self.last = torch.full((views,), math.inf, dtype=torch.float64)
+        self.last = [math.inf] * views
         """Loss at the last visit."""
-        self.resting: Bool[Tensor, "V"] = torch.zeros(views, dtype=torch.bool)
+        self.resting = [False] * views
 
     def skips(self, view: int) -> bool:
         """True when this visit is left out; the next one is not."""
-        rests = bool(self.resting[view])
-        self.resting[view] = False
+        rests, self.resting[view] = self.resting[view], False
         return rests
 
     def note(self, view: int, loss: float) -> None:
         """Take the loss of a visit."""
-        self.resting[view] = loss > (1 - self.LEAST_GAIN) * float(self.last[view])
+        self.resting[view] = loss > (1 - self.LEAST_GAIN) * self.last[view]
         self.last[view] = loss
 
     def tensors(self) -> dict[str, Tensor]:
-        return {"last": self.last, "resting": self.resting}
+        last, resting = torch.tensor(self.last, dtype=torch.float64), torch.tensor(self.resting, dtype=torch.bool)
+        return {"last": last, "resting": resting}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        self.last, self.resting = tensors["last"], tensors["resting"]
+        self.last, self.resting = tensors["last"].tolist(), tensors["resting"].tolist()
 
 
 class Bands:

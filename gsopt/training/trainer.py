@@ -126,7 +126,7 @@ class Trainer:
 
     def _passed(self, index: int) -> tuple[float, str]:
         """A step that computes nothing: its view's last loss, and its name."""
-        loss = float(self._resting.last[index])
+        loss = self._resting.last[index]
         self._change_set()
         self._end_when_flat(loss)
         return loss, self.scene.drawn[index].name

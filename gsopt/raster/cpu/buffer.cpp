@@ -3,6 +3,9 @@
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
 
 #include "frame.h"
 
@@ -24,6 +27,15 @@ void Buffer::reserve(size_t bytes) {
   capacity_ = grown;
 #if defined(MADV_HUGEPAGE)
   if (page == kLargePage) madvise(data_, grown, MADV_HUGEPAGE);
+#endif
+}
+
+// Arrays of a few MB are made and dropped all the time, and the system clears every page that it hands out anew: what
+// was freed stays at hand, up to 128 MB.
+void keep_freed_memory() {
+#if defined(__GLIBC__)
+  mallopt(M_MMAP_THRESHOLD, 32 << 20);  // the most that mallopt takes
+  mallopt(M_TRIM_THRESHOLD, 128 << 20);
 #endif
 }
 

@@ -30,6 +30,8 @@ class Buffer {
   size_t capacity_ = 0;
 };
 
+void keep_freed_memory();
+
 // A splat on the image plane: (8a) has its exponent in base 2, log2_opacity - (A dx + B dy)² - (C dy)².
 struct alignas(64) Record {
   float mx, my, A, B, C, log2_opacity, r, g;

@@ -36,7 +36,7 @@ struct Workspace {
   Work work;                                  // summed over frames while count_work is set
   std::map<std::string, double> seconds;      // wall time per stage since construction
   std::map<std::string, double> cpu_seconds;  // the same in CPU time of the whole process
-  Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) {}
+  Workspace(int threads, const std::string& isa) : pool(threads), kernels(choose_kernels(isa)) { keep_freed_memory(); }
 };
 
 template <class Stage> void timed(Workspace& ws, const char* name, Stage&& stage) {
