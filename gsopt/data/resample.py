@@ -61,7 +61,8 @@ def _area_along(planes: Tensor, axis: int, size: int) -> Tensor:
     ends = torch.arange(1, size + 1, dtype=torch.float64) * source / size
     first = starts.floor().long()
     total = planes.new_zeros(*planes.shape[:axis], size, *planes.shape[axis + 1 :])
-    for offset in range(math.ceil(step) + 1):
+    reach = source // size if source % size == 0 else math.ceil(step) + 1  # source pixels that one target pixel touches
+    for offset in range(reach):
         # The share of source pixel `first + offset` that lies inside the target pixel.
         index = first + offset
         overlap = (torch.minimum(ends, index + 1.0) - torch.maximum(starts, index.double())).clamp(min=0)

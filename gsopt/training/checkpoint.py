@@ -71,6 +71,11 @@ def saved(folder: Path) -> list[Path]:
     return [path for _, path in sorted(found, reverse=True)]
 
 
+def newest_saved(folder: Path) -> Path | None:
+    """The checkpoint of the newest step, None where there is none."""
+    return next(iter(saved(folder)), None)
+
+
 def load_newest(folder: Path, warn: Report) -> Checkpoint | None:
     """The newest checkpoint that can be read, None where there is none; every broken one is reported to `warn`."""
     for path in saved(folder):

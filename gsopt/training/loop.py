@@ -29,7 +29,7 @@ from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.raster.device.memory import PRIOR_BYTES, Memory, free_bytes, is_out_of_memory
 from gsopt.raster.threads import one_torch_thread
-from gsopt.training.checkpoint import load_newest, save_checkpoint, saved
+from gsopt.training.checkpoint import load_newest, newest_saved, save_checkpoint
 from gsopt.training.estimate import estimate, memory_limit
 from gsopt.training.few_photos import few_photo_warnings
 from gsopt.training.finite import require_finite, require_finite_loss
@@ -191,14 +191,15 @@ def require_memory(
 
 
 @contextmanager
-def gpu_memory(step: int, last_good: Path | None) -> Iterator[None]:
+def gpu_memory(step: int, checkpoints: Path) -> Iterator[None]:
     """NumericalError, with the way on, where a GPU's memory ends in the middle of a run."""
     try:
         yield
     except (RuntimeError, NumericalError) as error:
         if not is_out_of_memory(error) and not is_out_of_memory(error.__cause__):
             raise
-        state = f"The last good state is {last_good}." if last_good else "No checkpoint was written yet."
+        newest = newest_saved(checkpoints)
+        state = f"The last good state is {newest}." if newest else "No checkpoint was written yet."
         raise NumericalError(
             f"The GPU's memory ended in step {step + 1}: {error} {state} Go on with the CPU (--resume --backend cpu), "
             "or start in another folder with a lower --max-gaussians."
@@ -296,9 +297,9 @@ def _advance(trainer: Trainer, directory: RunDirectory, stop: StopRequest, clock
     while not trainer.finished:
         if stop:
             return True
-        with gpu_memory(trainer.step, _last_good(directory)):
+        with gpu_memory(trainer.step, directory.checkpoints):
             loss, view = trainer.advance()
-        require_finite_loss(loss, view, trainer.step, _last_good(directory))
+        require_finite_loss(loss, view, trainer.step, directory.checkpoints)
         if trainer.step % FINITE_EVERY == 0:
             _check_finite(trainer, directory)
         try:
@@ -321,7 +322,7 @@ def is_due(step: int, every: int) -> bool:
 def _finish(trainer: Trainer, directory: RunDirectory, clock: Clock) -> None:
     """The last checkpoint and splat.ply."""
     _save(trainer, directory, clock)
-    require_finite(trainer.result.items(), trainer.step, _last_good(directory))
+    require_finite(trainer.result.items(), trainer.step, directory.checkpoints)
     save_ply(directory.path / "splat.ply", trainer.result.to("cpu"), antialiased=trainer.plan.antialiased)
     if trainer.poses is not None:
         write_atomic(directory.path / "poses.json", to_json(trainer.poses.record(trainer.scene.origin)))
@@ -369,11 +370,7 @@ def _report_progress(trainer: Trainer, directory: RunDirectory, clock: Clock) ->
 
 
 def _check_finite(trainer: Trainer, directory: RunDirectory) -> None:
-    require_finite(trainer.model.gaussians.items(), trainer.step, _last_good(directory))
-
-
-def _last_good(directory: RunDirectory) -> Path | None:
-    return next(iter(saved(directory.checkpoints)), None)
+    require_finite(trainer.model.gaussians.items(), trainer.step, directory.checkpoints)
 
 
 def peak_memory_mb() -> float | None:

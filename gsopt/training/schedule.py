@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from gsopt.config.train import OptimizerConfig
@@ -81,6 +82,11 @@ class Schedule:
     def refines(self, step: int) -> bool:
         """True when Gaussians are added and removed after this step."""
         return step % self.refine_every == 0 and self.refine_start < step <= self.refine_stop
+
+    def next_refinement(self, step: int) -> int | None:
+        """The first step from this one on that `refines`, None where there is none."""
+        due = math.ceil(max(step, self.refine_start + 1) / self.refine_every) * self.refine_every
+        return due if due <= self.refine_stop else None
 
     def resets(self, step: int) -> bool:
         """True when adc lowers the opacities after this step (Kerbl et al. 2023, section 5.2)."""

@@ -82,13 +82,25 @@ class Targets:
         if factor != self._factor:
             self._kept.clear()
             self._factor, self._bytes = factor, 0
-        target = self._kept.get((index, whole)) or self._make(index, whole)
+        target = self._view(index, whole)
         if self._fixed is not None or target.alphas is None:
             return target
         colors = torch.addcmul(target.colors, 1 - target.alphas[..., None], background.to(self._device))
         return replace(target, colors=colors)
 
-    def _make(self, index: int, whole: bool) -> Target:
+    def _view(self, index: int, whole: bool) -> Target:
+        """View `index`, kept from an earlier step or made now; a window is cut out of the whole."""
+        if (index, whole) in self._kept:
+            return self._kept[index, whole]
+        entire = self._view(index, whole=True) if not whole else None
+        target = self._make(index) if entire is None else cropped(entire)
+        size = sum(image.nbytes for image in target.images.values()) if target is not entire else 0
+        if self._bytes + size <= self._budget:
+            self._kept[index, whole] = target
+            self._bytes += size
+        return target
+
+    def _make(self, index: int) -> Target:
         view = self._views[index]
         height, width = (downscaled_size(extent, self._factor) for extent in (view.camera.height, view.camera.width))
         colors, alphas = premultiplied(view.pixels().to(self._device), width, height)
@@ -96,15 +108,7 @@ class Targets:
             colors = torch.addcmul(colors, 1 - alphas[..., None], self._fixed.to(self._device))
         camera = view.camera.to(torch.float32).resized(width, height)
         depths = view.inverse_depths(height, width)
-        target = Target(camera, colors, alphas, (height, width), view.color, depths)
-        if not whole:
-            target = cropped(target)
-        target = moved(target, self._device)
-        size = sum(image.nbytes for image in target.images.values())
-        if self._bytes + size <= self._budget:
-            self._kept[index, whole] = target
-            self._bytes += size
-        return target
+        return moved(Target(camera, colors, alphas, (height, width), view.color, depths), self._device)
 
 
 def moved(target: Target, device: torch.device) -> Target:

@@ -18,7 +18,7 @@ from gsopt.raster.backend import Backend, Gradients, RasterSettings
 from gsopt.training.averaging import RunningAverage
 from gsopt.training.checkpoint import Checkpoint
 from gsopt.training.content_window import draws_whole
-from gsopt.training.density import at_least_one, make_density
+from gsopt.training.density import at_least_one, is_full, make_density
 from gsopt.training.density.contribution import contributions, least
 from gsopt.training.exposure import Exposure
 from gsopt.training.floaters import floaters, haze
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
 # The parts of a model that a checkpoint carries.
 RECORDS = ("gaussians", "exp_avg", "exp_avg_sq")
-# Share of the budget from which on what adds least makes room: below it, growth has room of its own.
-FULL = 0.95
 
 
 class Trainer:
@@ -147,23 +145,20 @@ class Trainer:
         row = None if self.exposure is None else self.exposure.row(index)
         loss = frame_loss(self.backend, frame, target, self.plan.weights, background, self.exposure, row, self.step)
         bands = self._guidance is not None and self._guidance.is_due(self.step)  # which adds its own to them
-        absgrad = self._wants_absgrad()
+        watches = self._density.watches(self.step, len(self.model))
+        absgrad = watches and self.plan.density.absgrad
         through = loss.v_colors, loss.v_alphas, loss.v_depths
         gradients = self.backend.backward(frame, *through, absgrad=absgrad, bands=bands, into=self._spent)
         self._spent = gradients
         if self.plan.near_distance > 0:
             weaken_near(gradients, self.model.gaussians.means, target.camera, self.plan.near_distance)
-        self._density.after_backward(self.step, gradients, frame.radii, target.size[1], target.size[0])
+        if watches:
+            self._density.after_backward(gradients, frame.radii, target.size[1], target.size[0])
         if self.plan.residual_bands and self._bands.watches(self.step):
             self._bands.note(self.model.gaussians, target.camera, gradients)
         if target.color == 1:
             self.means.update(self.step, loss.photometric, frame.colors, target)
         return loss.photometric, self._regularized(gradients, dropout)
-
-    def _wants_absgrad(self) -> bool:
-        """True when adc will read absolute gradients of this step."""
-        density = self.plan.density
-        return density.absgrad and density.strategy == "adc" and self.step <= self._schedule.refine_stop
 
     def _dropout(self) -> Dropout | None:
         """With few views a step draws a random part of the Gaussians."""
@@ -213,7 +208,7 @@ class Trainer:
     def _make_room(self) -> None:
         """Remove what adds least to the input views where nothing can grow for want of room."""
         density = self.plan.density
-        if density.turnover > 0 and len(self.model) >= FULL * density.max_gaussians:
+        if density.turnover > 0 and is_full(len(self.model), density):
             gaussians = self.model.gaussians
             values = contributions(gaussians, self._cameras(), self.backend, antialiased=self.plan.antialiased)
             self._select(~least(values, density.turnover))

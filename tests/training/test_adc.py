@@ -69,8 +69,8 @@ def test_statistics_are_the_mean_norm_in_normalized_device_coordinates() -> None
     v = torch.tensor([[3.0, 0.0], [0.5, 1.0], [0.0, 0.0]])
     gradients = pulled(3, torch.tensor([0]))
     gradients.means2d.copy_(v)
-    density.after_backward(1, gradients, radii, width=20, height=10)
-    density.after_backward(2, gradients, radii * torch.tensor([[1], [0], [0]], dtype=torch.int32), width=20, height=10)
+    density.after_backward(gradients, radii, width=20, height=10)
+    density.after_backward(gradients, radii * torch.tensor([[1], [0], [0]], dtype=torch.int32), width=20, height=10)
     torch.testing.assert_close(density.grad_sum, torch.tensor([60.0, 2 * math.hypot(5, 5), 0.0]))
     assert density.seen.tolist() == [2, 1, 0]
 
@@ -78,7 +78,7 @@ def test_statistics_are_the_mean_norm_in_normalized_device_coordinates() -> None
 def test_the_absolute_gradient_is_used_when_there_is_one() -> None:
     model = OptimizedGaussians.start(cloud(4, seed=1))
     density = controlled(model)
-    density.after_backward(1, pulled(4, torch.tensor([2]), absolute=True), seen(4), 10, 10)
+    density.after_backward(pulled(4, torch.tensor([2]), absolute=True), seen(4), 10, 10)
     assert density.grad_sum.nonzero().flatten().tolist() == [2]
 
 
@@ -87,7 +87,7 @@ def test_what_is_pulled_becomes_two_halves_and_the_rest_stays() -> None:
     model = OptimizedGaussians.start(gaussians)
     model.exp_avg.means.fill_(7.0)
     density = controlled(model)
-    density.after_backward(5, pulled(4, torch.tensor([0, 1])), seen(4), 10, 10)
+    density.after_backward(pulled(4, torch.tensor([0, 1])), seen(4), 10, 10)
     grown = density.refine(10, model)
 
     assert len(grown) == 6  # 2, 3, the first halves of 0 and 1, the second ones
@@ -103,8 +103,36 @@ def test_what_is_pulled_becomes_two_halves_and_the_rest_stays() -> None:
 def test_below_the_threshold_nothing_grows() -> None:
     model = OptimizedGaussians.start(scene([SMALL, LARGE], [0.5, 0.5]))
     density = controlled(model)
-    density.after_backward(5, pulled(2, torch.tensor([0, 1]), strength=0.9e-3 / 5), seen(2), 10, 10)
+    density.after_backward(pulled(2, torch.tensor([0, 1]), strength=0.9e-3 / 5), seen(2), 10, 10)
     assert len(density.refine(10, model)) == 2
+
+
+@pytest.mark.parametrize(
+    ("step", "count", "turnover", "watched"),
+    [(1, 94, 0.0, True), (1, 95, 0.0, False), (100, 94, 0.0, True), (101, 94, 0.2, False)]
+    + [(step, 95, 0.2, watched) for step, watched in ((40, False), (41, True), (50, True), (51, False))]
+    + [(50, 95, 0.0, False), (62, 95, 0.2, True), (82, 100, 0.2, False)],
+)
+def test_a_step_is_watched_where_the_next_refinement_has_room_or_makes_some(
+    step: int, count: int, turnover: float, watched: bool
+) -> None:
+    """Refinements every 10 steps until 100; those at 50, 70 and 80 make room."""
+    config = replace(CONFIG, max_gaussians=100, turnover=turnover)
+    assert controlled(OptimizedGaussians.start(cloud(3, seed=1)), config).watches(step, count) == watched
+
+
+@pytest.mark.parametrize(("transparent", "left"), [(0, 20), (1, 20), (2, 18)])
+def test_a_set_that_stays_full_is_left_alone(transparent: int, left: int) -> None:
+    """19 of 20 is full; what was summed is forgotten all the same."""
+    opacities = [0.5 * CONFIG.prune_opacity] * transparent + [0.5] * (20 - transparent)
+    model = OptimizedGaussians.start(scene([SMALL] * 20, opacities))
+    density = controlled(model, replace(CONFIG, max_gaussians=20))
+    density.after_backward(pulled(20, torch.arange(20)), seen(20), 10, 10)
+    refined = density.refine(10, model)
+    assert len(refined) == left
+    assert (refined is model) == (left == 20)
+    assert len(density.grad_sum) == left
+    assert not density.grad_sum.any()
 
 
 @pytest.mark.parametrize("budget", [10, 13, 17, 20, 25])
@@ -114,7 +142,7 @@ def test_the_budget_is_exact_and_goes_to_the_highest_scores(budget: int) -> None
     density = controlled(model, config)
     gradients = pulled(10, torch.arange(10))
     gradients.means2d[:, 0] = torch.arange(1.0, 11.0).flip(0)
-    density.after_backward(5, gradients, seen(10), 10, 10)
+    density.after_backward(gradients, seen(10), 10, 10)
     grown = density.refine(10, model)
     assert len(grown) == min(budget, 20)
     halved = min(budget, 20) - 10
@@ -159,7 +187,7 @@ def test_neither_the_huge_nor_the_transparent_are_split() -> None:
     for step, rows in ((10, 4), (60, 2)):  # the huge stay until opacities were reset
         model = OptimizedGaussians.start(gaussians)
         density = controlled(model)
-        density.after_backward(5, pulled(3, torch.arange(3)), seen(3), 10, 10)
+        density.after_backward(pulled(3, torch.arange(3)), seen(3), 10, 10)
         assert len(density.refine(step, model)) == rows
 
 
@@ -191,7 +219,7 @@ def test_something_is_always_left() -> None:
 def test_statistics_follow_rows_and_return_from_a_checkpoint() -> None:
     model = OptimizedGaussians.start(cloud(6, seed=1))
     density = controlled(model)
-    density.after_backward(1, pulled(6, torch.tensor([1, 4]), 2.0), seen(6), 10, 10)
+    density.after_backward(pulled(6, torch.tensor([1, 4]), 2.0), seen(6), 10, 10)
     rows = torch.tensor([4, 0, 5])
     before = density.grad_sum[rows]
     density.select(rows)
@@ -207,6 +235,6 @@ def test_the_mean_over_the_views_decides_and_not_the_sum(strength: float, count:
     """Three views of 10 px pull one Gaussian by that share of the threshold each."""
     model = OptimizedGaussians.start(scene([LARGE] * 3, [0.5] * 3))
     density = controlled(model)
-    for step in (5, 6, 7):
-        density.after_backward(step, pulled(3, torch.tensor([1]), strength * 1e-3 / 5), seen(3), 10, 10)
+    for _ in range(3):
+        density.after_backward(pulled(3, torch.tensor([1]), strength * 1e-3 / 5), seen(3), 10, 10)
     assert len(density.refine(10, model)) == count

@@ -23,6 +23,7 @@ from gsopt.formats import load_splats
 from gsopt.formats.ply import save_ply
 from gsopt.raster.api import make_backend
 from gsopt.training import loop
+from gsopt.training.checkpoint import newest_saved
 from gsopt.training.plan import RunPlan
 from gsopt.training.run_directory import RunDirectory, opened
 
@@ -225,11 +226,10 @@ def test_the_end_of_a_run_writes_its_splats_poses_and_exposures(scene: Scene, tm
 
 
 def test_the_newest_checkpoint_is_the_last_good_state(tmp_path: Path) -> None:
-    directory: Any = SimpleNamespace(checkpoints=tmp_path)
-    assert loop._last_good(directory) is None
+    assert newest_saved(tmp_path) is None
     for step in (10, 30, 20):
         (tmp_path / f"step_{step:06d}.safetensors").touch()
-    assert loop._last_good(directory) == tmp_path / "step_000030.safetensors"
+    assert newest_saved(tmp_path) == tmp_path / "step_000030.safetensors"
 
 
 def test_held_out_images_are_read_before_the_work() -> None:

@@ -204,3 +204,7 @@ def test_an_opacity_at_the_limit_is_dead() -> None:
 def test_the_last_row_is_drawn_by_its_weight_too() -> None:
     rows = draw(torch.tensor([1.0, 1.0, 6.0]), 8000, torch.Generator().manual_seed(0))
     assert (torch.bincount(rows, minlength=3) / 1000).tolist() == pytest.approx([1, 1, 6], abs=0.15)
+
+
+def test_no_step_is_watched() -> None:
+    assert not any(controlled().watches(step, 40) for step in (1, 10, 99, 100))

@@ -306,3 +306,11 @@ def test_a_run_that_adds_nothing_is_settled_from_its_first_step() -> None:
     assert [run.is_settled(step) for step in (0, 1)] == [False, True]
     assert [replace(run, refine_stop=7).is_settled(step) for step in (7, 8)] == [False, True]
     assert [replace(run, coarse_until=(3, 9)).is_settled(step) for step in (9, 10)] == [False, True]
+
+
+@given(st.integers(0, 60), st.integers(1, 25), st.integers(0, 130))
+def test_the_next_refinement_is_the_first_step_that_refines(start: int, every: int, stop: int) -> None:
+    config = TrainConfig(density=DensityConfig(refine_start=start, refine_every=every, refine_stop=stop))
+    schedule = plan.make_schedule(config, 1000, MANY, extent=1.0, pixels=1.0)
+    for step in range(1, 140):
+        assert schedule.next_refinement(step) == next((s for s in range(step, 140) if schedule.refines(s)), None)

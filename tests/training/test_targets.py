@@ -84,3 +84,29 @@ def test_a_coarser_target_covers_the_same_field_of_view_and_keeps_the_mean() -> 
     boxes = full.colors.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
     torch.testing.assert_close(half.colors, boxes)
     assert torch.equal(targets.get(0, 1, WHITE).colors, full.colors)
+
+
+def test_the_whole_image_and_its_window_are_made_at_once() -> None:
+    """In either order: the file is read once, and what was kept is the same record."""
+    for first in (False, True):
+        view = pictures(4, 1, 80, 96)[0]
+        view.values[:, 48:] = 0
+        targets = Targets([view], WHITE, 10**6)  # type: ignore[list-item]
+        got = {whole: targets.get(0, 1, WHITE, whole=whole) for whole in (first, not first)}
+        window, entire = got[False], got[True]
+        assert entire.colors.shape == (80, 96, 3)
+        assert torch.equal(window.colors, entire.colors[:, :64])
+        assert view.reads == 1
+        assert targets.get(0, 1, WHITE, whole=False) is window
+
+
+def test_an_image_without_a_smaller_window_is_kept_once() -> None:
+    """Two of these fill the budget, although each is asked for both ways."""
+    views = pictures(4, 2)
+    for view in views:
+        view.values[..., 3] = 255
+    targets = Targets(views, WHITE, 6 * 10 * 4 * 4 * 2)  # type: ignore[arg-type]
+    for _ in range(2):
+        for index in (0, 1):
+            assert targets.get(index, 1, WHITE, whole=False) is targets.get(index, 1, WHITE)
+    assert [view.reads for view in views] == [1, 1]

@@ -55,18 +55,19 @@ class Told:
 
 
 @torch.no_grad()
-def test_density_control_sees_the_gradients_of_every_step_by_the_whole_image(scene: Scene) -> None:
+def test_density_control_sees_the_gradients_of_every_watched_step_by_the_whole_image(scene: Scene) -> None:
     trainer = made(scene)
-    trainer._density = Told(refine=lambda step, model: model)  # type: ignore[assignment]
-    for step in (1, 2):
+    trainer._density = Told(refine=lambda step, model: model, watches=lambda step, count: step != 2)  # type: ignore[assignment]
+    for seen in (1, 1, 2):
         trainer.advance()
         calls = trainer._density.named("after_backward")  # type: ignore[attr-defined]
-        assert len(calls) == step
-        number, gradients, radii, width, height = calls[-1]
-        assert (number, width, height) == (step, SIZE, SIZE)
+        assert len(calls) == seen
+        gradients, radii, width, height = calls[-1]
+        assert (width, height) == (SIZE, SIZE)
         assert gradients is trainer._spent
         assert radii.shape == (30, 2)
-    assert len(trainer._density.named("after_step")) == 2  # type: ignore[attr-defined]
+    assert trainer._density.named("watches") == [(1, 30), (2, 30), (3, 30)]  # type: ignore[attr-defined]
+    assert len(trainer._density.named("after_step")) == 3  # type: ignore[attr-defined]
 
 
 def ending(step: int, **changes: Any) -> Any:
@@ -289,23 +290,17 @@ def test_gradients_weaken_near_a_camera_where_a_distance_is_set(
     assert asked == [distance] * (distance > 0)
 
 
-@pytest.mark.parametrize(
-    ("absgrad", "strategy", "step", "wanted"),
-    [
-        (True, "adc", 25, True),
-        (True, "adc", 26, False),
-        (False, "adc", 5, False),
-        (True, "mcmc", 5, False),
-    ],
-)
-def test_absolute_gradients_are_computed_for_adc_up_to_its_last_refinement(
-    scene: Scene, absgrad: bool, strategy: Any, step: int, wanted: bool
+@torch.no_grad()
+@pytest.mark.parametrize(("absgrad", "watches"), list(itertools.product([True, False], repeat=2)))
+def test_absolute_gradients_are_computed_for_watched_steps_that_want_them(
+    scene: Scene, absgrad: bool, watches: bool
 ) -> None:
     trainer = made(scene)
-    trainer.plan = replace(trainer.plan, density=replace(trainer.plan.density, absgrad=absgrad, strategy=strategy))
-    trainer.step = step
-    assert trainer._schedule.refine_stop == 25
-    assert trainer._wants_absgrad() == wanted
+    trainer.plan = replace(trainer.plan, density=replace(trainer.plan.density, absgrad=absgrad))
+    trainer._density = Told(refine=lambda step, model: model, watches=watches)  # type: ignore[assignment]
+    trainer.advance()
+    assert trainer._spent is not None
+    assert (trainer._spent.means2d_abs is not None) == (absgrad and watches)
 
 
 @torch.no_grad()

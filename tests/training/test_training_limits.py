@@ -273,13 +273,14 @@ def test_progress_is_due_half_a_second_after_the_last(monkeypatch: pytest.Monkey
     assert not clock.is_due()
 
 
-def test_the_memory_of_a_gpu_that_ends_names_the_step_and_the_last_good_state() -> None:
-    told = r"ended in step 8: .*last good state is a\.safetensors"
-    with pytest.raises(NumericalError, match=told), loop.gpu_memory(7, Path("a.safetensors")):
+def test_the_memory_of_a_gpu_that_ends_names_the_step_and_the_last_good_state(tmp_path: Path) -> None:
+    with pytest.raises(NumericalError, match="No checkpoint was written yet"), loop.gpu_memory(7, tmp_path):
         raise torch.OutOfMemoryError("CUDA out of memory")
-    with pytest.raises(NumericalError, match="No checkpoint was written yet"), loop.gpu_memory(7, None):
+    (tmp_path / "step_000005.safetensors").touch()
+    told = r"ended in step 8: .*last good state is .*step_000005\.safetensors"
+    with pytest.raises(NumericalError, match=told), loop.gpu_memory(7, tmp_path):
         raise torch.OutOfMemoryError("CUDA out of memory")
-    with pytest.raises(RuntimeError, match="another"), loop.gpu_memory(7, None):
+    with pytest.raises(RuntimeError, match="another"), loop.gpu_memory(7, tmp_path):
         raise RuntimeError("another")
 
 

@@ -13,14 +13,19 @@ from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
 from gsopt.training.schedule import Schedule
 
+FULL = 0.95
+"""Share of the budget from which on a set is full: there is no room that would be worth a copy of all rows."""
+
 
 class DensityControl(Protocol):
-    """Watches every step and now and then changes the set of Gaussians."""
+    """Watches the steps whose say counts, and now and then changes the set of Gaussians."""
 
-    def after_backward(
-        self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
-    ) -> None:
-        """Note what one view's backward pass says; image size in px."""
+    def watches(self, step: int, count: int) -> bool:
+        """True when this step's backward pass has a say in the next change of a set of `count` Gaussians."""
+        ...
+
+    def after_backward(self, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int) -> None:
+        """Note what a watched view's backward pass says; image size in px."""
         ...
 
     def after_step(self, model: OptimizedGaussians, lr_means: float) -> None:
@@ -55,6 +60,11 @@ def make_density(
     from gsopt.training.density.adc import Adc
 
     return Adc(plan, schedule, count, device)
+
+
+def is_full(count: int, plan: DensityPlan) -> bool:
+    """True when `count` Gaussians leave no room worth the work."""
+    return count >= FULL * plan.max_gaussians
 
 
 def at_least_one(keep: Bool[Tensor, "N"], scores: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsopt.gaussians import Gaussians
 from gsopt.geometry import quats as quaternions
 from gsopt.raster.backend import Gradients
-from gsopt.training.density import at_least_one
+from gsopt.training.density import at_least_one, is_full
 from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
 from gsopt.training.schedule import Schedule
@@ -41,12 +41,16 @@ class Adc:
         self.seen = torch.zeros(count, dtype=torch.int32, device=self._device)
         """Number of views in which the Gaussian was drawn."""
 
-    def after_backward(
-        self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
-    ) -> None:
+    def watches(self, step: int, count: int) -> bool:
+        """True when the next refinement will have room to grow into, or make some."""
+        due = self._schedule.next_refinement(step)
+        return due is not None and (not is_full(count, self._plan) or self._makes_room(due))
+
+    def _makes_room(self, step: int) -> bool:
+        return self._plan.turnover > 0 and self._schedule.turns_over(step)
+
+    def after_backward(self, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int) -> None:
         """Accumulate the gradient of the projected centers. Rows that were not drawn have none and are not counted."""
-        if step > self._schedule.refine_stop:
-            return
         v = gradients.means2d_abs if gradients.means2d_abs is not None else gradients.means2d
         self.grad_sum += torch.hypot(v[:, 0] * (0.5 * width), v[:, 1] * (0.5 * height))
         self.seen += radii[:, 0] > 0
@@ -73,11 +77,13 @@ class Adc:
         self.grad_sum, self.seen = (tensors[name].to(self._device) for name in ("grad_sum", "seen"))
 
     def _grow_and_prune(self, step: int, model: OptimizedGaussians) -> OptimizedGaussians:
-        """Split what stays where its mean gradient is above the threshold."""
+        """Split what stays where its mean gradient is above the threshold. A set that stays full is left alone."""
         gaussians = model.gaussians
+        keep = at_least_one(self._keep(step, gaussians), gaussians.logit_opacities)
+        if is_full(int(keep.sum()), self._plan):
+            return model
         scores = self.grad_sum / self.seen.clamp_min(1)
         room = max(0, self._plan.max_gaussians - len(model))
-        keep = at_least_one(self._keep(step, gaussians), gaussians.logit_opacities)
         splitting = best((scores > self._plan.grow_grad2d) & keep, scores, room)
         return model.select(keep & ~splitting).append(split(gaussians.select(splitting)))
 

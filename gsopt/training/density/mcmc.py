@@ -36,10 +36,12 @@ class Mcmc:
         self._schedule = schedule
         self._generator = generator
 
-    def after_backward(
-        self, step: int, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int
-    ) -> None:
+    def watches(self, step: int, count: int) -> bool:
         """Needs no statistics."""
+        return False
+
+    def after_backward(self, gradients: Gradients, radii: Int[Tensor, "N 2"], width: int, height: int) -> None:
+        """Nothing to note."""
 
     def after_step(self, model: OptimizedGaussians, lr_means: float) -> None:
         """Stochastic gradient Langevin dynamics: means += lr · noise_lr · sigmoid(-100 (o - 0.005)) · Σ ξ (eq. 10)."""
