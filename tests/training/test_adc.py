@@ -109,9 +109,9 @@ def test_below_the_threshold_nothing_grows() -> None:
 
 @pytest.mark.parametrize(
     ("step", "count", "turnover", "watched"),
-    [(1, 94, 0.0, True), (1, 95, 0.0, False), (100, 94, 0.0, True), (101, 94, 0.2, False)]
-    + [(step, 95, 0.2, watched) for step, watched in ((40, False), (41, True), (50, True), (51, False))]
-    + [(50, 95, 0.0, False), (62, 95, 0.2, True), (82, 100, 0.2, False)],
+    [(1, 98, 0.0, True), (1, 99, 0.0, False), (100, 98, 0.0, True), (101, 98, 0.2, False)]
+    + [(step, 99, 0.2, watched) for step, watched in ((40, False), (41, True), (50, True), (51, False))]
+    + [(50, 99, 0.0, False), (62, 99, 0.2, True), (82, 100, 0.2, False)],
 )
 def test_a_step_is_watched_where_the_next_refinement_has_room_or_makes_some(
     step: int, count: int, turnover: float, watched: bool
@@ -121,16 +121,16 @@ def test_a_step_is_watched_where_the_next_refinement_has_room_or_makes_some(
     assert controlled(OptimizedGaussians.start(cloud(3, seed=1)), config).watches(step, count) == watched
 
 
-@pytest.mark.parametrize(("transparent", "left"), [(0, 20), (1, 20), (2, 18)])
+@pytest.mark.parametrize(("transparent", "left"), [(0, 100), (1, 100), (2, 98)])
 def test_a_set_that_stays_full_is_left_alone(transparent: int, left: int) -> None:
-    """19 of 20 is full; what was summed is forgotten all the same."""
-    opacities = [0.5 * CONFIG.prune_opacity] * transparent + [0.5] * (20 - transparent)
-    model = OptimizedGaussians.start(scene([SMALL] * 20, opacities))
-    density = controlled(model, replace(CONFIG, max_gaussians=20))
-    density.after_backward(pulled(20, torch.arange(20)), seen(20), 10, 10)
+    """99 of 100 are full; what was summed is forgotten all the same."""
+    opacities = [0.5 * CONFIG.prune_opacity] * transparent + [0.5] * (100 - transparent)
+    model = OptimizedGaussians.start(scene([SMALL] * 100, opacities))
+    density = controlled(model, replace(CONFIG, max_gaussians=100))
+    density.after_backward(pulled(100, torch.arange(100)), seen(100), 10, 10)
     refined = density.refine(10, model)
     assert len(refined) == left
-    assert (refined is model) == (left == 20)
+    assert (refined is model) == (left == 100)
     assert len(density.grad_sum) == left
     assert not density.grad_sum.any()
 

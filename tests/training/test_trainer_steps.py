@@ -220,8 +220,8 @@ def test_bands_decide_and_room_is_made_where_they_are_due() -> None:
     assert asked.named("decide") == asked.named("make_room") == []
 
 
-@pytest.mark.parametrize(("count", "turnover", "made_room"), [(95, 0.2, True), (94, 0.2, False), (100, 0.0, False)])
-def test_room_is_made_where_nineteen_twentieths_of_it_are_taken(
+@pytest.mark.parametrize(("count", "turnover", "made_room"), [(99, 0.2, True), (98, 0.2, False), (100, 0.0, False)])
+def test_room_is_made_where_99_of_100_places_are_taken(
     count: int, turnover: float, made_room: bool, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[Any] = []

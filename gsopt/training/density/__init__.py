@@ -13,7 +13,7 @@ from gsopt.training.optimizer import OptimizedGaussians
 from gsopt.training.plan import DensityPlan
 from gsopt.training.schedule import Schedule
 
-FULL = 0.95
+FULL = 0.99
 """Share of the budget from which on a set is full: there is no room that would be worth a copy of all rows."""
 
 
