@@ -91,7 +91,7 @@ def test_the_whole_image_and_its_window_are_made_at_once() -> None:
     for first in (False, True):
         view = pictures(4, 1, 80, 96)[0]
         view.values[:, 48:] = 0
-        targets = Targets([view], WHITE, 10**6)  # type: ignore[list-item]
+        targets = Targets([view], WHITE, 10**6)
         got = {whole: targets.get(0, 1, WHITE, whole=whole) for whole in (first, not first)}
         window, entire = got[False], got[True]
         assert entire.colors.shape == (80, 96, 3)
@@ -105,7 +105,7 @@ def test_an_image_without_a_smaller_window_is_kept_once() -> None:
     views = pictures(4, 2)
     for view in views:
         view.values[..., 3] = 255
-    targets = Targets(views, WHITE, 6 * 10 * 4 * 4 * 2)  # type: ignore[arg-type]
+    targets = Targets(views, WHITE, 6 * 10 * 4 * 4 * 2)
     for _ in range(2):
         for index in (0, 1):
             assert targets.get(index, 1, WHITE, whole=False) is targets.get(index, 1, WHITE)
