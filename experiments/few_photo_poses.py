@@ -29,6 +29,7 @@ import torch
 from gsopt.benchmark.machine import machine
 from gsopt.data.posed_images import PosedImage
 from gsopt.data.scene import read_dataset
+from gsopt.data.sfm.placement import rotation_to_z
 from gsopt.data.sfm.trajectory import centers, compare
 from gsopt.events import to_json, write_atomic
 from gsopt.geometry.farthest_points import farthest_points
@@ -126,10 +127,20 @@ def agreement_with_all(posed_all: Path, scene: Path) -> dict[str, float]:
     return {f"{name}_against_all": value for name, value in errors(found, truth).items()}
 
 
+def looking(frame: PosedImage) -> Any:
+    """The pose whose axis goes through the middle of the photo, also where that of the lens does not: photos may be cut
+    out of larger ones, and the published poses take their middles for the lens's."""
+    aside = (np.array([frame.width, frame.height]) / 2 - frame.K[:2, 2].numpy()) / frame.K[0, 0].item()
+    ray = np.append(aside, 1.0) / np.linalg.norm(np.append(aside, 1.0))
+    turned = np.eye(4)
+    turned[:3, :3] = rotation_to_z(ray)
+    return turned @ frame.viewmat.numpy()
+
+
 def errors(found: dict[str, PosedImage], truth: dict[str, PosedImage]) -> dict[str, float]:
     """Root mean square and maximum, after the best similarity."""
     names = sorted(found)
-    error = compare(viewmats([found[name] for name in names]), viewmats([truth[name] for name in names]))
+    error = compare(*(np.stack([looking(poses[name]) for name in names]) for poses in (found, truth)))
     return {key: value for key, value in error.summary().items() if not key.endswith("median")}
 
 

@@ -42,7 +42,8 @@ REMEDIES = {
 
 TURNTABLE = (
     "The background stands still in all photos: the object was turned, not the camera, and only what turns was used. "
-    "Turn it by 20 degrees between photos, on a patterned cloth that turns with it."
+    "Turn it by 20 degrees between photos, on a patterned cloth that turns with it; masks help: outlines join photos "
+    "from all around that share few features."
 )
 
 

@@ -79,6 +79,8 @@ class Hypotheses:
     matches: list[tuple[str, PairMatches]]
     turntable: bool
     """True when a background at rest was left out."""
+    turning: PairMatches | None
+    """All that moves inside the masks, as of an object on a turntable; nothing without masks."""
 
 
 def match_few(project: ColmapProject, masks: Path | None, learned: LearnedMatches | None) -> Hypotheses:
@@ -87,13 +89,18 @@ def match_few(project: ColmapProject, masks: Path | None, learned: LearnedMatche
     With learned features, what three photos contradict is left out.
     """
     pairs = match_features(project) if learned is None else joined_matches(project, learned)
-    moving = without_background(project.pycolmap, pairs, project.config.seed, jointly=learned is not None)
+    seed, joint = project.config.seed, learned is not None
+    moving = without_background(project.pycolmap, pairs, seed, jointly=joint)
     agreed = moving or pairs
     if learned is not None:
-        agreed = consistent(on_epipolar_lines(project.pycolmap, agreed, project.config.seed))
+        agreed = consistent(on_epipolar_lines(project.pycolmap, agreed, seed))
     whole = [("the whole photos", agreed)]
-    masked = [] if masks is None else [("the masks", inside(agreed, masks))]
-    return Hypotheses(masked + whole, moving is not None)
+    if masks is None:
+        return Hypotheses(whole, moving is not None, None)
+    turning = moving if joint else without_background(project.pycolmap, pairs, seed, jointly=True)
+    return Hypotheses(
+        [("the masks", inside(agreed, masks)), *whole], moving is not None, inside(turning or pairs, masks)
+    )
 
 
 def find_few_poses(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +47,13 @@ class PairMatches:
     sizes: dict[int, tuple[int, int]]
     keypoints: dict[int, Points]
     matches: dict[ImagePair, Matches]
-    turntable: bool = False
-    """True where a background at rest was left out."""
+    shifts: Mapping[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
+    """The places of a background at rest, which was left out, in each photo, px, zero on average; empty without one."""
+
+    @property
+    def turntable(self) -> bool:
+        """True where a background at rest was left out."""
+        return bool(self.shifts)
 
     def points(self, pair: ImagePair) -> tuple[Points, Points]:
         """Positions of the matches of a pair in both photos, px."""
@@ -127,7 +132,7 @@ def without_background(pycolmap: Any, pairs: PairMatches, seed: int, *, jointly:
         return pairs.kept({pair: ~rows for pair, rows in found.items()})
     shifts = _shifts(pairs, found)
     moving = pairs.kept({pair: ~_background(pairs, pair, still[pair], shifts) for pair in compared})
-    return replace(moving, turntable=True)
+    return replace(moving, shifts=shifts)
 
 
 def _shifts(pairs: PairMatches, still: Mapping[ImagePair, Bool[np.ndarray, "M"]]) -> dict[int, Float[np.ndarray, "2"]]:

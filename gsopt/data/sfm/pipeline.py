@@ -32,6 +32,7 @@ from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch
 from gsopt.data.sfm.refusal import too_few
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.stage_times import StageTimes
+from gsopt.data.sfm.turntable_poses import TURNTABLE
 from gsopt.data.sfm.video import extract_frames, is_video
 from gsopt.data.sfm.write_scene import SCENE, write_scene
 from gsopt.data.working_folder import sweep, working_folder
@@ -150,7 +151,8 @@ class _Run:
         report.advice += found.notes + diagnosis.split_groups(found.graph, mapped.names)
         names, viewmats = poses(mapped.reconstruction)
         report.advice += diagnosis.wide_gaps(names, viewmats)
-        report.advice += diagnosis.weak_links(names, shared_points(mapped.reconstruction, names))
+        if mapped.mapper != TURNTABLE:  # its axis holds what few points do
+            report.advice += diagnosis.weak_links(names, shared_points(mapped.reconstruction, names))
         return report
 
     def _placed(self, mapped: MappingResult, frames: list[PosedImage] | None) -> Similarity:

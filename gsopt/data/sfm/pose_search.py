@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -26,12 +27,14 @@ from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, matc
 from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.masks import FeatureInput
+from gsopt.data.sfm.pair_matches import PairMatches
 from gsopt.data.sfm.photo_agreement import Agreement, agreement
 from gsopt.data.sfm.photos import Photo
 from gsopt.data.sfm.settings import SfmConfig
 from gsopt.data.sfm.silhouettes import CONTRADICTED
 from gsopt.data.sfm.stage_times import StageTimes
 from gsopt.data.sfm.trajectory import turns_apart
+from gsopt.data.sfm.turntable_poses import TURNTABLE, find_turned, mask_outlines, one_lens
 from gsopt.errors import UsageError
 from gsopt.events import Report
 
@@ -202,13 +205,25 @@ class PoseSearch:
         project = replace(project, database=project.database.with_name("thorough.db"))
         features.extract(project, self.photos, None, thorough=True)
         hypotheses = few_photos.match_few(project, self.inputs.masks, self.learned)
+        lens = None if hypotheses.turning is None else one_lens(project)  # below, guesses replace its focal length
         again, graph = few_photos.find_few_poses(project, hypotheses.matches, self.report)
+        again = self._turned(project, lens, hypotheses.turning, again)
         if CONTRADICTED <= misses < math.inf:
             better = misses > self._outline_misses(again)
         else:
             better = trust < few_photos.MIN_OBSERVATIONS or placed < (len(again.names) if again is not None else 0)
         notes = [diagnosis.TURNTABLE] if hypotheses.turntable else []
         return replace(found, graph=graph, mapped=again, notes=notes) if better else found
+
+    def _turned(
+        self, project: ColmapProject, lens: Any, turning: PairMatches | None, again: MappingResult | None
+    ) -> MappingResult | None:
+        """The poses of an object that turns about one axis, where they place more photos."""
+        placed = len(again.names) if again is not None else 0
+        if placed == len(self.photos) or lens is None or turning is None or self.inputs.masks is None:
+            return again
+        turned = find_turned(project, lens, turning, mask_outlines(self.inputs.masks, turning), self.report)
+        return again if turned is None or len(turned.names) <= placed else turned
 
     def _outline_misses(self, mapped: MappingResult | None) -> float:
         """Misses of the outlines of what was found, px; infinite for nothing."""
@@ -235,7 +250,10 @@ class PoseSearch:
 
 
 def _holds_others(one: MappingResult, other: MappingResult) -> bool:
-    """True where one places as many photos as the other, with other poses, and more holds them."""
+    """True where one places as many photos as the other, with other poses, and more holds them, or where outlines hold
+    more photos about one axis."""
+    if one.mapper == TURNTABLE and len(one.names) > len(other.names):
+        return True
     found = [dict(zip(*mapping.poses(mapped.reconstruction), strict=True)) for mapped in (one, other)]
     common = sorted(one.names & other.names)
     apart = turns_apart(*(np.array([viewmats[name] for name in common]).reshape(-1, 4, 4) for viewmats in found))

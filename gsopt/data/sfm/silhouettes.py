@@ -54,6 +54,8 @@ MIN_PIXELS = 20
 """Outline pixels that every photo needs."""
 FREEDOM = 6
 
+Pixels = tuple[Float[Tensor, "R"], Float[Tensor, "R"]]
+
 
 @dataclass(frozen=True)
 class CoherentPoses:
@@ -77,7 +79,7 @@ class CoherentPoses:
 
 def coherent_poses(views: Sequence[View]) -> CoherentPoses | None:
     """Poses of views with alpha on which the silhouettes agree most, or None if a photo has no outline."""
-    outlines = [_outline(view) for view in views]
+    outlines = [outline(view) for view in views]
     if any(len(outline.pixels()[0]) < MIN_PIXELS for outline in outlines):
         return None
     with one_torch_thread():
@@ -90,7 +92,7 @@ def contradicting(views: Sequence[View]) -> list[int]:
     Views are left out one by one, always the one without which the others miss least, as long as more than half stay.
     """
     with one_torch_thread():
-        coherence = Coherence([_outline(view) for view in views])
+        coherence = Coherence([outline(view) for view in views])
         distances = coherence.distances(coherence.viewmats, coherence.across(coherence.viewmats))
         agreeing = list(range(len(views)))
         enough = min(CONTRADICTED, MOST_MISSES_LEFT * coherence.misses_among(agreeing, distances))
@@ -102,7 +104,7 @@ def contradicting(views: Sequence[View]) -> list[int]:
     return []
 
 
-def _outline(view: View) -> Outline:
+def outline(view: View) -> Outline:
     """A photo's silhouette at a bounded size."""
     pixels = view.pixels()
     factor = max(1.0, max(pixels.shape[:2]) / MAX_SIDE)
@@ -114,10 +116,11 @@ def _outline(view: View) -> Outline:
 class Coherence:
     """Outlines, the rays through their pixels, and (1) for any poses of their cameras."""
 
-    def __init__(self, outlines: list[Outline]) -> None:
+    def __init__(self, outlines: Sequence[Outline], pixels: Sequence[Pixels] | None = None) -> None:
+        """`pixels`: those of the outlines that are compared, if not all."""
         self.outlines = outlines
         self.viewmats = torch.cat([outline.camera.viewmats for outline in outlines]).double()
-        pixels = [outline.pixels() for outline in outlines]
+        pixels = [outline.pixels() for outline in outlines] if pixels is None else pixels
         counts = torch.tensor([len(column) for column, _ in pixels])
         self._own = torch.arange(len(outlines)).repeat_interleave(counts)
         self._directions = torch.cat([_directions(o, *p) for o, p in zip(outlines, pixels, strict=True)])
@@ -150,7 +153,7 @@ class Coherence:
     def misses_among(self, chosen: list[int], distances: Float[Tensor, "C R S"]) -> float:
         """Root mean square of (1) without the other views, px."""
         rays = torch.isin(self._own, torch.tensor(chosen))
-        return _rms(self.misses(distances[chosen][:, rays]))
+        return rms(self.misses(distances[chosen][:, rays]))
 
     def jacobian(
         self, viewmats: Float[Tensor, "C 4 4"], depths: Float[Tensor, "R S"], distances: Float[Tensor, "C R S"]
@@ -243,7 +246,7 @@ def _refined(silhouettes: Coherence) -> CoherentPoses:
     depths = silhouettes.near_optima(viewmats)
     distances = silhouettes.distances(viewmats, depths)
     misses = silhouettes.misses(distances)
-    before = _rms(misses)
+    before = rms(misses)
     if before <= COHERENT:
         return CoherentPoses(viewmats, before, before)
     cost, damping = _cost(misses, motions, prior), 1e-2
@@ -267,7 +270,7 @@ def _refined(silhouettes: Coherence) -> CoherentPoses:
         if gained <= LEAST_GAIN * cost:
             break
         cost -= gained
-    return CoherentPoses(viewmats, before, _rms(misses))
+    return CoherentPoses(viewmats, before, rms(misses))
 
 
 def _cost(misses: Float[Tensor, "R"], motions: Float[Tensor, "D"], prior: Float[Tensor, "D"]) -> float:
@@ -275,5 +278,5 @@ def _cost(misses: Float[Tensor, "R"], motions: Float[Tensor, "D"], prior: Float[
     return float(RAY_WEIGHT * rays.sum() + (prior * motions**2).sum() / 2)
 
 
-def _rms(misses: Float[Tensor, "R"]) -> float:
+def rms(misses: Float[Tensor, "R"]) -> float:
     return float(misses.square().mean().sqrt())

@@ -146,8 +146,8 @@ def test_matches_inside_the_masks_come_first_and_learned_ones_must_be_consistent
     masks: Path | None, turntable: bool, learned: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def moving(pycolmap: object, pairs: str, seed: int, *, jointly: bool) -> str | None:
-        assert (seed, jointly) == (7, learned)
-        return f"moving {pairs}" if turntable else None
+        assert seed == 7
+        return f"moving{' jointly' if jointly else ''} {pairs}" if turntable else None
 
     monkeypatch.setattr(few_photos, "match_features", lambda project: "sift")
     monkeypatch.setattr(few_photos, "joined_matches", lambda project, learned: learned)
@@ -158,10 +158,13 @@ def test_matches_inside_the_masks_come_first_and_learned_ones_must_be_consistent
     project: Any = SimpleNamespace(pycolmap=None, config=SfmConfig(seed=7))
     given: Any = "joined" if learned else None
     found = match_few(project, masks, given)
-    whole = ("moving " if turntable else "") + ("joined on lines, consistent" if learned else "sift")
+    moved = ("moving jointly " if learned else "moving ") if turntable else ""
+    whole = moved + ("joined on lines, consistent" if learned else "sift")
     inside = [] if masks is None else [("the masks", f"{whole}, inside masks")]
     assert found.matches == [*inside, ("the whole photos", whole)]
     assert found.turntable == turntable
+    turning = ("moving jointly " if turntable else "") + ("joined" if learned else "sift")
+    assert found.turning == (None if masks is None else f"{turning}, inside masks")
 
 
 def test_a_background_at_rest_takes_all_trust(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,7 +66,7 @@ def test_a_second_look_is_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(run, "_mapped", lambda *_: None)
     monkeypatch.setattr(features, "extract", lambda *_, **__: None)
     monkeypatch.setattr(few_photos, "trust", lambda *_: 0)
-    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False))
+    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, graph({})))
     assert run._with_learned(nothing) is nothing
     assert lines == ["many photos find no place: looking for learned features too"]
@@ -150,12 +150,28 @@ def test_poses_are_other_ones_beyond_five_degrees_and_need_more_support_and_as_m
         return apart
 
     def result(key: str) -> Any:
-        return SimpleNamespace(reconstruction=key, names=set(names[key]))
+        return SimpleNamespace(reconstruction=key, names=set(names[key]), mapper="few photos")
 
     monkeypatch.setattr(mapping, "poses", lambda key: (names[key], viewmats[key]))
     monkeypatch.setattr(pose_search, "turns_apart", turns)
     monkeypatch.setattr(pose_search, "support", {"one": support, "other": 9.0}.__getitem__)
     assert pose_search._holds_others(result("one"), result("other")) == others
+
+
+@pytest.mark.parametrize(("mapper", "photos", "holds"), [("turntable", 6, True), ("few photos", 6, False)])
+def test_more_photos_about_one_axis_hold(
+    mapper: str, photos: int, holds: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mapping, "poses", lambda names: (sorted(names), np.zeros((len(names), 4, 4))))
+    monkeypatch.setattr(pose_search, "turns_apart", lambda *_: 0.0)
+    monkeypatch.setattr(pose_search, "support", len)
+
+    def result(count: int, mapper: str) -> Any:
+        names = {str(n) for n in range(count)}
+        return SimpleNamespace(reconstruction=names, names=names, mapper=mapper)
+
+    assert pose_search._holds_others(result(photos, mapper), result(5, "few photos")) == holds
+    assert not pose_search._holds_others(result(5, mapper), result(5, "few photos"))
 
 
 @pytest.mark.parametrize(
@@ -169,7 +185,7 @@ def test_one_look_is_enough_where_150_points_place_all_photos_and_no_outline_con
     run = search(tmp_path, [])
     monkeypatch.setattr(features, "extract", lambda *_, **__: looks.append("again"))
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
-    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False))
+    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, graph({})))
     monkeypatch.setattr(pose_search, "outline_misses", lambda *_: misses)
     first: Any = SimpleNamespace(names={f"{i}.png" for i in range(placed)}, reconstruction=None)

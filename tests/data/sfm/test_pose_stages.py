@@ -89,7 +89,7 @@ def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setattr(
         pose_search.features, "extract", lambda project, photos, masks, thorough=False: looks.append(thorough)
     )
-    nothing = SimpleNamespace(matches=[], turntable=False)
+    nothing = SimpleNamespace(matches=[], turntable=False, turning=None)
     monkeypatch.setattr(few_photos, "trust", lambda *_: 0)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: nothing)
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, "another graph"))
@@ -113,7 +113,7 @@ def second_look(
     monkeypatch.setattr(pose_search.features, "extract", lambda *_, **__: None)
     monkeypatch.setattr(pose_search, "outline_misses", lambda reconstruction, *_: misses[reconstruction])
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
-    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True))
+    monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (looks[1], "another graph"))
     run = search(tmp_path, 6)
     first = FoundPoses("graph", looks[0], "both")  # type: ignore[arg-type]

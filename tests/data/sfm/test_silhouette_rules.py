@@ -154,7 +154,7 @@ def test_a_turn_by_a_degree_weighs_as_much_as_a_shift_by_a_fiftieth_of_the_radiu
 @pytest.mark.parametrize(("pixels", "enough"), [(20, True), (19, False)])
 def test_every_photo_needs_twenty_outline_pixels(pixels: int, enough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     counts: Any = [90, pixels, 90]
-    monkeypatch.setattr(silhouettes, "_outline", lambda n: SimpleNamespace(pixels=lambda: (range(n), range(n))))
+    monkeypatch.setattr(silhouettes, "outline", lambda n: SimpleNamespace(pixels=lambda: (range(n), range(n))))
     monkeypatch.setattr(silhouettes, "Coherence", len)
     monkeypatch.setattr(silhouettes, "_refined", lambda number: f"{number} refined")
     assert coherent_poses(counts) == ("3 refined" if enough else None)
@@ -170,7 +170,7 @@ def test_masks_are_compared_at_512_px_at_most(size: tuple[int, int], compared: t
     pixels[: height // 2, :, 3] = 255
     K = torch.tensor([[[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]]])
     view: Any = SimpleNamespace(pixels=lambda: pixels, camera=Cameras(torch.eye(4)[None], K, width, height))
-    outline = silhouettes._outline(view)
+    outline = silhouettes.outline(view)
     assert (outline.camera.width, outline.camera.height) == compared
     assert tuple(outline.alpha.shape) == (1, compared[1], compared[0])
     assert outline.alpha.mean().item() == pytest.approx(0.5, abs=1e-3)
@@ -194,7 +194,7 @@ def named(monkeypatch: pytest.MonkeyPatch, count: int, misses: dict[frozenset[in
         def misses_among(self, chosen: list[int], distances: None) -> float:
             return misses.get(self.all - frozenset(chosen), 99.0)
 
-    monkeypatch.setattr(silhouettes, "_outline", lambda view: view)
+    monkeypatch.setattr(silhouettes, "outline", lambda view: view)
     monkeypatch.setattr(silhouettes, "Coherence", Missing)
     views: Any = list(range(count))
     return contradicting(views)

@@ -132,7 +132,7 @@ def test_photos_without_an_outline_move_nothing(views: tuple[View, ...]) -> None
 
 
 def test_the_derivatives_are_those_of_the_misses_among_the_same_points(views: tuple[View, ...]) -> None:
-    coherence = Coherence([silhouettes._outline(view) for view in disturbed(views, 0.7)])
+    coherence = Coherence([silhouettes.outline(view) for view in disturbed(views, 0.7)])
     depths = coherence.near_optima(coherence.viewmats)
     J = coherence.jacobian(coherence.viewmats, depths, coherence.distances(coherence.viewmats, depths))
     for column in (0, 4, 11, 25):
