@@ -20,7 +20,7 @@ Feature = tuple[int, int]
 
 
 def reconstructed(project: ColmapProject, camera: Any, pairs: PairMatches, turned: Turned) -> Any:
-    """A reconstruction with these poses, a camera for each photo, and points fitted to them."""
+    """A reconstruction with these poses, a camera for each photo, and colored points fitted to them."""
     pycolmap = project.pycolmap
     model = pycolmap.Reconstruction()
     for photo, viewmat in zip(turned.photos, turned.viewmats, strict=True):
@@ -32,6 +32,7 @@ def reconstructed(project: ColmapProject, camera: Any, pairs: PairMatches, turne
     for track in tracks(pairs, turned, camera):
         elements = [pycolmap.TrackElement(*feature) for feature in track]
         model.add_point3D(_meeting(model, track), pycolmap.Track(elements))
+    model.extract_colors_for_all_images(project.photos)
     return bundle_adjusted(project, model, lens=False, poses=False)
 
 

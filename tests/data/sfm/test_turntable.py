@@ -96,7 +96,11 @@ def lens(focal: float | None) -> Any:
 
 
 def found(pairs: PairMatches, masks: Path, focal: float | None) -> MappingResult | None:
-    project: Any = SimpleNamespace(pycolmap=pycolmap, config=SfmConfig(seed=1))
+    photos = masks.parent / "photos"
+    photos.mkdir(exist_ok=True)
+    for name in pairs.names.values():
+        Image.new("RGB", (SIZE, SIZE), (10, 20, 30)).save(photos / name)
+    project: Any = SimpleNamespace(pycolmap=pycolmap, config=SfmConfig(seed=1), photos=photos)
     return find_turned(project, lens(focal), pairs, mask_outlines(masks, pairs), lambda line: None)
 
 
@@ -134,6 +138,8 @@ def test_chains_without_a_point_in_common_are_joined_by_outlines(
     assert lenses == pytest.approx([FOCAL] * COUNT, rel=1e-9 if focal else 0.04)
     assert result.reconstruction.num_points3D() > 0.8 * POINTS * len(CHAINED)
     assert result.reconstruction.compute_mean_reprojection_error() < 0.4
+    colors = {tuple(point.color.tolist()) for point in result.reconstruction.points3D.values()}
+    assert colors == {(10, 20, 30)}
 
 
 def test_photos_cut_out_of_larger_ones_have_their_own_middles(cameras: Cameras, tmp_path: Path) -> None:
