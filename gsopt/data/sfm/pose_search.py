@@ -27,7 +27,6 @@ from gsopt.data.sfm.joined_features import LearnedMatches, learned_matches, matc
 from gsopt.data.sfm.learned_features import LearnedMatcher
 from gsopt.data.sfm.mapping import MappingResult
 from gsopt.data.sfm.masks import FeatureInput
-from gsopt.data.sfm.pair_matches import PairMatches
 from gsopt.data.sfm.photo_agreement import Agreement, agreement
 from gsopt.data.sfm.photos import Photo
 from gsopt.data.sfm.settings import SfmConfig
@@ -61,6 +60,21 @@ class FoundPoses:
     """The kind that was used."""
     notes: list[str] = field(default_factory=list)
     """Advice for the report."""
+
+
+@dataclass(frozen=True)
+class SecondLook:
+    """Matches of few photos with thorough features."""
+
+    project: ColmapProject
+    hypotheses: few_photos.Hypotheses
+    lens: Any | None
+    """The camera of all photos, if there is one."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Advice for the report."""
+        return [diagnosis.TURNTABLE] if self.hypotheses.turntable else []
 
 
 class PoseSearch:
@@ -190,40 +204,44 @@ class PoseSearch:
     def _looked_thoroughly(self, project: ColmapProject, found: FoundPoses) -> FoundPoses:
         """The poses of few photos after a second look, where they need one, held by silhouettes."""
         with self.times.of("mapping"):
-            found = self._few(project, found)
-            return found if found.mapped is None else self._held(project, found, found.mapped)
+            found, look = self._few(project, found)
+            if found.mapped is not None:
+                found = self._held(project, found, found.mapped)
+            return found if look is None else self._turned(look, found)
 
-    def _few(self, project: ColmapProject, found: FoundPoses) -> FoundPoses:
-        """Look a second time, with thorough features, where what was found cannot be trusted; returns the better."""
+    def _few(self, project: ColmapProject, found: FoundPoses) -> tuple[FoundPoses, SecondLook | None]:
+        """Look a second time, with thorough features, where what was found cannot be trusted; returns the better, and
+        what was seen."""
         mapped = found.mapped
         trust = few_photos.trust(project, mapped)
         placed = len(mapped.names) if mapped is not None else 0
         misses = self._outline_misses(mapped)
         if placed == len(self.photos) and trust >= few_photos.STRONG_OBSERVATIONS and misses < CONTRADICTED:
-            return found
+            return found, None
         self.report(f"few photos with little in common: looking thoroughly for features (masks: {self.inputs.kind})")
         project = replace(project, database=project.database.with_name("thorough.db"))
         features.extract(project, self.photos, None, thorough=True)
         hypotheses = few_photos.match_few(project, self.inputs.masks, self.learned)
         lens = None if hypotheses.turning is None else one_lens(project)  # below, guesses replace its focal length
+        look = SecondLook(project, hypotheses, lens)
         again, graph = few_photos.find_few_poses(project, hypotheses.matches, self.report)
-        again = self._turned(project, lens, hypotheses.turning, again)
         if CONTRADICTED <= misses < math.inf:
             better = misses > self._outline_misses(again)
         else:
             better = trust < few_photos.MIN_OBSERVATIONS or placed < (len(again.names) if again is not None else 0)
-        notes = [diagnosis.TURNTABLE] if hypotheses.turntable else []
-        return replace(found, graph=graph, mapped=again, notes=notes) if better else found
+        return (replace(found, graph=graph, mapped=again, notes=look.notes) if better else found), look
 
-    def _turned(
-        self, project: ColmapProject, lens: Any, turning: PairMatches | None, again: MappingResult | None
-    ) -> MappingResult | None:
+    def _turned(self, look: SecondLook, found: FoundPoses) -> FoundPoses:
         """The poses of an object that turns about one axis, where they place more photos."""
-        placed = len(again.names) if again is not None else 0
-        if placed == len(self.photos) or lens is None or turning is None or self.inputs.masks is None:
-            return again
-        turned = find_turned(project, lens, turning, mask_outlines(self.inputs.masks, turning), self.report)
-        return again if turned is None or len(turned.names) <= placed else turned
+        placed = len(found.mapped.names) if found.mapped is not None else 0
+        turning = look.hypotheses.turning
+        if placed == len(self.photos) or look.lens is None or turning is None or self.inputs.masks is None:
+            return found
+        outlines = mask_outlines(self.inputs.masks, turning)
+        turned = find_turned(look.project, look.lens, turning, outlines, self.report)
+        if turned is None or len(turned.names) <= placed:
+            return found
+        return self._held(look.project, replace(found, mapped=turned, notes=look.notes), turned)
 
     def _outline_misses(self, mapped: MappingResult | None) -> float:
         """Misses of the outlines of what was found, px; infinite for nothing."""

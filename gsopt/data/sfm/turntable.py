@@ -41,7 +41,7 @@ MAX_TURN, MAX_SCREW = 120.0, 0.3
 """A pair whose own motion says where the axis is turns by less, degrees, and moves less along it, a share."""
 
 Ends = tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]
-"""Where the matches of a pair end in both photos, px from the middle of each."""
+"""Places of the matches of a pair in both photos, px from the middle of each."""
 
 
 @dataclass(frozen=True)

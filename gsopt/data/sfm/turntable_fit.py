@@ -42,7 +42,7 @@ class Turned:
     angles: Float[np.ndarray, "C"]
     """Radians."""
     shifts: Float[np.ndarray, "C 2"]
-    """How far each photo's middle lies from where the background puts it, px."""
+    """Distance of each photo's middle from where the background puts it, px."""
 
     @property
     def viewmats(self) -> Float[np.ndarray, "C 4 4"]:
@@ -89,7 +89,7 @@ class Silhouettes:
     outlines: Mapping[int, Outline]
     pixels: Mapping[int, Pixels]
     middles: Mapping[int, Float[np.ndarray, "2"]]
-    """Where the background puts the middle of each photo, px of the outline."""
+    """The middle of each photo as the background says, px of the outline."""
     scale: float
     """Pixels of an outline in one of the photo."""
 

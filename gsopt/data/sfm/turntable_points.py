@@ -60,7 +60,7 @@ def _fitting_rows(pairs: PairMatches, turned: Turned, camera: Any) -> Iterator[t
 
 
 def middle(camera: Any, pairs: PairMatches, photo: int) -> Float[np.ndarray, "2"]:
-    """Where the axis of the lens meets a photo, as its background says."""
+    """The point where the axis of the lens meets a photo, as its background says."""
     return np.array([camera.principal_point_x, camera.principal_point_y]) + pairs.shifts.get(photo, np.zeros(2))
 
 

@@ -65,7 +65,7 @@ FITS = 2
 
 @dataclass(frozen=True)
 class Shown:
-    """What photos of a turntable show."""
+    """Matches and outlines of photos of a turntable."""
 
     points: Matches
     """Ends of the matches of each pair, px from the middles of their photos."""

@@ -86,7 +86,7 @@ def test_silhouettes_move_poses_or_refute_them_and_their_advice_comes_last(
 ) -> None:
     run = search(tmp_path, [])
     first = MappingResult("found", "few photos", [{"b.png"}])
-    monkeypatch.setattr(run, "_few", lambda project, found: found)
+    monkeypatch.setattr(run, "_few", lambda project, found: (found, None))
     monkeypatch.setattr(pose_search, "held_by_silhouettes", lambda *_: (held, ["They do not fit."]))
     found = run._looked_thoroughly(None, FoundPoses(graph(CHAIN), first, "both", ["Turntable."]))  # type: ignore[arg-type]
     assert found.mapped == (None if held is None else replace(first, reconstruction="moved"))
@@ -190,5 +190,5 @@ def test_one_look_is_enough_where_150_points_place_all_photos_and_no_outline_con
     monkeypatch.setattr(pose_search, "outline_misses", lambda *_: misses)
     first: Any = SimpleNamespace(names={f"{i}.png" for i in range(placed)}, reconstruction=None)
     found = FoundPoses(graph(CHAIN), first, "sift")
-    assert run._few(run._project(tmp_path, "sift"), found) is found
+    assert run._few(run._project(tmp_path, "sift"), found)[0] is found
     assert looks == ([] if enough else ["again"])

@@ -95,7 +95,10 @@ def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, "another graph"))
     run = search(tmp_path, 0)
     first = FoundPoses(graph(CHAIN), None, "sift")
-    assert run._few(run._project(tmp_path, "sift"), first) == FoundPoses("another graph", None, "sift")  # type: ignore[arg-type]
+    found, look = run._few(run._project(tmp_path, "sift"), first)
+    assert found == FoundPoses("another graph", None, "sift")  # type: ignore[arg-type]
+    assert look is not None
+    assert (look.hypotheses, look.lens, look.notes) == (nothing, None, [])
     assert looks == [True]
 
 
@@ -117,7 +120,7 @@ def second_look(
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (looks[1], "another graph"))
     run = search(tmp_path, 6)
     first = FoundPoses("graph", looks[0], "both")  # type: ignore[arg-type]
-    found: Any = run._few(run._project(tmp_path, "both"), first)
+    found: Any = run._few(run._project(tmp_path, "both"), first)[0]
     taken = bool(found.graph == "another graph")
     assert (found.graph, found.mapped) == (("another graph", looks[1]) if taken else ("graph", looks[0]))
     assert (found.features, len(found.notes)) == ("both", int(taken))
@@ -270,7 +273,7 @@ def test_poses_that_are_given_are_not_looked_for(posed: bool, tmp_path: Path, mo
         "_mapped": lambda *_: first,
         "_wants_learned": lambda mapped: True,
         "_with_learned": lambda found: looked.append("learned") or found,
-        "_few": lambda project, found: looked.append("few") or found,
+        "_few": lambda project, found: (looked.append("few") or found, None),
         "_held": lambda project, found, mapped: looked.append("held") or found,
         "_agreement": lambda found: looked.append("agreement") or Agreement(0, 0),
     }

@@ -16,10 +16,13 @@ from balls import FIELD_OF_VIEW, Ball, picture
 from PIL import Image
 
 from gsopt.data.sfm import pose_search, turntable_poses
+from gsopt.data.sfm.diagnosis import TURNTABLE
+from gsopt.data.sfm.few_photos import Hypotheses
 from gsopt.data.sfm.mapping import MappingResult, poses
 from gsopt.data.sfm.pair_matches import PairMatches
-from gsopt.data.sfm.pose_search import PoseSearch
+from gsopt.data.sfm.pose_search import FoundPoses, PoseSearch, SecondLook
 from gsopt.data.sfm.settings import SfmConfig
+from gsopt.data.sfm.stage_times import StageTimes
 from gsopt.data.sfm.trajectory import compare
 from gsopt.data.sfm.turntable import Link, Turntable, axes_of_pairs, chained, from_middles, links
 from gsopt.data.sfm.turntable_fit import Turned, fitted_angles
@@ -271,29 +274,61 @@ def test_a_track_has_one_feature_in_each_photo(cameras: Cameras) -> None:
 @pytest.mark.parametrize(
     ("placed", "turned", "camera", "masked", "taken"),
     [
-        (8, 8, "lens", True, "again"),
-        (7, 8, "lens", True, "turned"),
-        (7, 7, "lens", True, "again"),
-        (0, 3, "lens", True, "turned"),
-        (7, None, "lens", True, "again"),
-        (7, 8, None, True, "again"),
-        (7, 8, "lens", False, "again"),
+        (8, 8, "lens", True, False),
+        (7, 8, "lens", True, True),
+        (7, 7, "lens", True, False),
+        (0, 3, "lens", True, True),
+        (7, None, "lens", True, False),
+        (7, 8, None, True, False),
+        (7, 8, "lens", False, False),
     ],
 )
 def test_a_turntable_is_taken_where_it_places_more_photos(
-    placed: int, turned: int | None, camera: Any, masked: bool, taken: str, monkeypatch: pytest.MonkeyPatch
+    placed: int, turned: int | None, camera: Any, masked: bool, taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Its poses are held by silhouettes like all others, and advice on what was left out is no longer true."""
+
     def mapped(count: int | None) -> Any:
         return None if not count else SimpleNamespace(names=set(range(count)))
 
-    again, other = mapped(placed), mapped(turned)
+    other = mapped(turned)
     monkeypatch.setattr(pose_search, "find_turned", lambda *_: other)
     monkeypatch.setattr(pose_search, "mask_outlines", lambda *_: {})
     search: Any = SimpleNamespace(
-        photos=range(8), inputs=SimpleNamespace(masks=Path("m") if masked else None), report=None
+        photos=range(8),
+        inputs=SimpleNamespace(masks=Path("m") if masked else None),
+        report=None,
+        _held=lambda project, found, turned: ("held", found, turned),
     )
-    found = PoseSearch._turned(search, None, camera, "pairs", again)  # type: ignore[arg-type]
-    assert found is (other if taken == "turned" else again)
+    pairs: Any = "pairs"
+    look = SecondLook("project", Hypotheses([], True, pairs if masked else None), camera)  # type: ignore[arg-type]
+    first = FoundPoses("graph", mapped(placed), "both", ["left out"])  # type: ignore[arg-type]
+    found: Any = PoseSearch._turned(search, look, first)
+    again = FoundPoses("graph", other, "both", [TURNTABLE])  # type: ignore[arg-type]
+    assert found == (("held", again, other) if taken else first)
+
+
+@pytest.mark.parametrize("second", [False, True])
+@pytest.mark.parametrize("placed", [False, True])
+def test_a_turntable_is_looked_for_after_silhouettes_left_photos_out(
+    second: bool, placed: bool, tmp_path: Path
+) -> None:
+    steps: list[str] = []
+    first = FoundPoses("graph", "mapped" if placed else None, "both")  # type: ignore[arg-type]
+
+    def step(name: str, result: Any) -> Any:
+        return lambda *given: steps.append(name) or result
+
+    search: Any = SimpleNamespace(
+        times=StageTimes(),
+        _few=step("few", (first, "look" if second else None)),
+        _held=step("held", first),
+        _turned=step("turned", "turned"),
+    )
+    project: Any = "project"
+    found: Any = PoseSearch._looked_thoroughly(search, project, first)
+    assert found == ("turned" if second else first)
+    assert steps == ["few", *(["held"] if placed else []), *(["turned"] if second else [])]
 
 
 def test_photos_of_several_lenses_are_no_turntable(tmp_path: Path) -> None:
