@@ -1,8 +1,8 @@
 """From photos to poses: features, matches, mapping, and second looks where a first one cannot be trusted.
 
 features ─► matches ─► mapping ─► many left out: learned features too
-                               └► few photos: thorough features ─► silhouettes ─► the same with SIFT alone ─► do the
-                                  photos agree?
+                               └► few photos: thorough features ─► silhouettes ─► photos left out: turns about one axis
+                                  ─► the same with SIFT alone ─► do the photos agree?
 """
 
 from __future__ import annotations

@@ -17,12 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
 from gsopt.data.outlines import MAX_DISTANCE, Outline
 from gsopt.data.resample import downscaled_size, premultiplied_downscale
 from gsopt.data.scene import View
+from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.rigid_motion import rigid_motion
 from gsopt.raster.threads import one_torch_thread
 
@@ -106,11 +107,15 @@ def contradicting(views: Sequence[View]) -> list[int]:
 
 def outline(view: View) -> Outline:
     """A photo's silhouette at a bounded size."""
-    pixels = view.pixels()
+    return bounded_outline(view.pixels()[..., 3:], view.camera)
+
+
+def bounded_outline(pixels: UInt8[Tensor, "H W 1"], camera: Cameras) -> Outline:
+    """The outline of alpha or of a mask at a bounded size."""
     factor = max(1.0, max(pixels.shape[:2]) / MAX_SIDE)
-    width, height = (downscaled_size(size, factor) for size in (pixels.shape[1], pixels.shape[0]))
-    alpha = premultiplied_downscale(pixels, width, height)[3:] / 255
-    return Outline.of(view.camera.resized(width, height), alpha)
+    height, width = (downscaled_size(size, factor) for size in pixels.shape[:2])
+    alpha = premultiplied_downscale(pixels, width, height) / 255
+    return Outline.of(camera.resized(width, height), alpha)
 
 
 class Coherence:

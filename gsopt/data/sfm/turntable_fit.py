@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt.data.outlines import Outline
@@ -72,14 +72,18 @@ class Turned:
         first, second = (self.shifts[self.photos.index(photo)] for photo in pair)
         return ends[0] - first, ends[1] - second
 
+    def fits(self, points: Matches, most: float) -> dict[ImagePair, Bool[np.ndarray, "M"]]:
+        """Marks the matches between these photos that lie within `most` px of their epipolar lines."""
+        return {
+            pair: self.table.support(self.shifted(pair, ends), self.turn(pair), most)[0] > 0
+            for pair, ends in points.items()
+            if set(pair) <= set(self.photos)
+        }
+
     def fitting(self, points: Matches, most: float) -> dict[ImagePair, Ends]:
-        """The matches between these photos that lie within `most` px of their epipolar lines."""
-        found = {}
-        for pair, ends in points.items():
-            if set(pair) <= set(self.photos):
-                fits = self.table.support(self.shifted(pair, ends), self.turn(pair), most)[0] > 0
-                found[pair] = (ends[0][fits], ends[1][fits])
-        return found
+        """Those matches."""
+        fits = self.fits(points, most).items()
+        return {pair: (points[pair][0][marks], points[pair][1][marks]) for pair, marks in fits}
 
 
 @dataclass(frozen=True)

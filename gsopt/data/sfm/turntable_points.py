@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from gsopt.data.sfm.features import ColmapProject
@@ -14,6 +15,7 @@ from gsopt.data.sfm.mapping import bundle_adjusted
 from gsopt.data.sfm.pair_matches import PairMatches
 from gsopt.data.sfm.turntable import MAX_ERROR, from_middles
 from gsopt.data.sfm.turntable_fit import Turned
+from gsopt.geometry.focus import nearest_to_axes
 
 Feature = tuple[int, int]
 """The number of a photo and of a feature in it."""
@@ -51,11 +53,8 @@ def tracks(pairs: PairMatches, turned: Turned, camera: Any) -> list[list[Feature
 def _fitting_rows(pairs: PairMatches, turned: Turned, camera: Any) -> Iterator[tuple[Feature, Any]]:
     """The pairs, those with the most in common first, and their matches that fit."""
     middles = {photo: middle(camera, pairs, photo) for photo in pairs.names}
-    found = {}
-    for pair, ends in from_middles(pairs, middles).items():
-        if set(pair) <= set(turned.photos):
-            fits = turned.table.support(turned.shifted(pair, ends), turned.turn(pair), MAX_ERROR)[0] > 0
-            found[pair] = pairs.matches[pair][fits]
+    fits = turned.fits(from_middles(pairs, middles), MAX_ERROR)
+    found = {pair: pairs.matches[pair][marks] for pair, marks in fits.items()}
     yield from sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
 
 
@@ -77,13 +76,11 @@ def _camera(camera: Any, pairs: PairMatches, turned: Turned, photo: int) -> Any:
 
 def _meeting(model: Any, track: list[Feature]) -> Float[np.ndarray, "3"]:
     """The point nearest to the rays of features."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
+    centers, ways = [], []
     for photo, feature in track:
         image = model.image(photo)
         pose = image.cam_from_world().inverse()
         ray = np.append(model.camera(photo).cam_from_img(image.points2D[feature].xy), 1.0)
-        way = pose.rotation.matrix() @ (ray / np.linalg.norm(ray))
-        across = np.eye(3) - np.outer(way, way)
-        A += across
-        b += across @ pose.translation
-    return np.linalg.solve(A, b)
+        centers.append(pose.translation)
+        ways.append(pose.rotation.matrix() @ (ray / np.linalg.norm(ray)))
+    return nearest_to_axes(torch.from_numpy(np.array(centers)), torch.from_numpy(np.array(ways)), damping=0.0).numpy()

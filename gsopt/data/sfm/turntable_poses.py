@@ -21,12 +21,11 @@ from PIL import Image
 
 from gsopt.data.image_files import IMAGE_FORMATS
 from gsopt.data.outlines import Outline
-from gsopt.data.resample import downscaled_size, premultiplied_downscale
 from gsopt.data.sfm.features import ColmapProject
 from gsopt.data.sfm.held_lens import guessed_lens
 from gsopt.data.sfm.mapping import SMALLEST_MODEL, MappingResult
 from gsopt.data.sfm.pair_matches import ImagePair, PairMatches
-from gsopt.data.sfm.silhouettes import MAX_SIDE, MIN_PIXELS
+from gsopt.data.sfm.silhouettes import MIN_PIXELS, bounded_outline
 from gsopt.data.sfm.turntable import MAX_ERROR, Link, Turntable, axes_of_pairs, chained, from_middles, links
 from gsopt.data.sfm.turntable_fit import Matches, Silhouettes, Turned, fitted, fitted_angles
 from gsopt.data.sfm.turntable_points import middle, reconstructed
@@ -149,10 +148,8 @@ def mask_outlines(masks: Path, pairs: PairMatches) -> dict[int, Outline]:
 def _outline(mask: Path) -> Outline:
     with Image.open(mask, formats=IMAGE_FORMATS) as image:
         pixels = torch.from_numpy(np.array(image.convert("L")))[..., None]
-    factor = max(1.0, max(pixels.shape[:2]) / MAX_SIDE)
-    height, width = (downscaled_size(size, factor) for size in pixels.shape[:2])
-    alpha = premultiplied_downscale(pixels, width, height) / 255
-    return Outline.of(Cameras(torch.eye(4)[None], torch.eye(3)[None], width, height), alpha)
+    height, width = pixels.shape[:2]
+    return bounded_outline(pixels, Cameras(torch.eye(4)[None], torch.eye(3)[None], width, height))
 
 
 def _shown(camera: Any, pairs: PairMatches, outlines: Mapping[int, Outline]) -> Shown:
@@ -179,6 +176,8 @@ def _with_focal(project: ColmapProject, shown: Shown, focal: float, *, known: bo
     if len(groups[0]) >= SMALLEST_MODEL:
         table = shown.fitted(turned.only(groups[0]), focal=not known, every=SPARSE).table
         turned, groups = _chained(shown, table, links(table, shown.points))
+    if len(groups[0]) < 2:  # nothing to turn another photo against
+        return None
     return _joined(shown, turned.only(groups[0]), [turned.only(group) for group in groups[1:]])
 
 

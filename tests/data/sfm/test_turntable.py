@@ -46,7 +46,7 @@ TABLE = Turntable(np.array([0.0, math.cos(0.5), math.sin(0.5)]), np.array([0.0, 
 
 
 def turning_cameras() -> Cameras:
-    """What a camera that looks down by half a radian sees of a thing that turns."""
+    """Poses of a camera that looks down by half a radian at a thing that turns."""
     around = torch.from_numpy(ANGLES)
     eyes = 4 * torch.stack(
         [around.cos() * math.cos(0.5), around.sin() * math.cos(0.5), torch.full((COUNT,), math.sin(0.5))], 1
