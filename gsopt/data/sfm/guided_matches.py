@@ -24,6 +24,8 @@ MAX_TURN_DEGREES = 60.0
 RATIO = 0.85
 MAX_DISTANCE = 0.75
 """Farthest two descriptors may be apart, of unit length."""
+ROWS_AT_ONCE = 256
+"""Features compared with all of the other photo at once, which then fit into the processor's cache."""
 
 
 def with_guided_matches(project: ColmapProject, pairs: PairMatches, model: Any) -> Any:
@@ -66,7 +68,9 @@ def _write_guided(project: ColmapProject, pairs: PairMatches, model: Any, descri
             for b in placed[i + 1 :]:
                 first, second = model.image(a), model.image(b)
                 relative = second.cam_from_world() * first.cam_from_world().inverse()
-                if np.degrees(relative.rotation.angle()) > MAX_TURN_DEGREES:
+                if relative.rotation.matrix()[2, 2] < np.cos(
+                    np.radians(MAX_TURN_DEGREES)
+                ):  # a rolled camera sees the same
                     continue
                 fundamental = fundamental_matrix(
                     relative, model.camera(first.camera_id), model.camera(second.camera_id)
@@ -121,17 +125,24 @@ def guided(
         return np.zeros((0, 2), np.uint32)
     lines = (_homogeneous(first) @ fundamental.T).astype(np.float32)
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
-    far = np.abs(lines @ _homogeneous(second).T.astype(np.float32)) > limit
-    likeness = a @ b.T
-    likeness[far] = -1.0
-    best = likeness.argmax(axis=1)
-    rows = np.arange(len(a))
-    top = likeness[rows, best]
-    mutual = likeness.argmax(axis=0)[best] == rows
-    likeness[rows, best] = -1.0
-    distance, next_best = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, likeness.max(axis=1)))
-    keep = mutual & (top > 0) & (distance < MAX_DISTANCE) & (distance < RATIO * next_best)
-    return np.stack([rows[keep], best[keep]], axis=1).astype(np.uint32)
+    points = _homogeneous(second).T.astype(np.float32)
+    best = np.zeros(len(a), np.int64)
+    top, next_best, top_back = (np.full(count, -1.0, np.float32) for count in (len(a), len(a), len(b)))
+    for start in range(0, len(a), ROWS_AT_ONCE):
+        block = slice(start, start + ROWS_AT_ONCE)
+        likeness = a[block] @ b.T
+        likeness[np.abs(lines[block] @ points) > limit] = -1.0
+        rows = np.arange(len(likeness))
+        np.maximum(top_back, likeness.max(axis=0), out=top_back)
+        best[block] = likeness.argmax(axis=1)
+        top[block] = likeness[rows, best[block]]
+        likeness[rows, best[block]] = -1.0
+        next_best[block] = likeness.max(axis=1)
+    distance, next_distance = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, next_best))
+    mutual = (top > 0) & (top == top_back[best])
+    rows = np.flatnonzero(mutual & (distance < MAX_DISTANCE) & (distance < RATIO * next_distance))
+    firsts = np.sort(np.unique(best[rows], return_index=True)[1])  # equal features have one partner at most
+    return np.stack([rows[firsts], best[rows[firsts]]], axis=1).astype(np.uint32)
 
 
 def _homogeneous(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:

@@ -8,6 +8,7 @@ features ─► matches ─► mapping ─► many left out: learned features to
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -137,12 +138,21 @@ class PoseSearch:
         config = replace(self.config, features=kind)
         return ColmapProject(self.pycolmap, folder / "database.db", self.inputs.photos, config)
 
+    def _extract(self, project: ColmapProject, *, thorough: bool = False) -> None:
+        """SIFT features, inside the masks or thorough; those of an earlier look at the same photos are taken again."""
+        kept = self.work / ("thorough-features.db" if thorough else "features.db")
+        if kept.is_file():
+            shutil.copyfile(kept, project.database)
+            return
+        features.extract(project, self.photos, None if thorough else self.inputs.masks, thorough=thorough)
+        shutil.copyfile(project.database, kept)
+
     def _graph(self, project: ColmapProject, frames: list[PosedImage] | None = None) -> ViewGraph:
         names = [photo.name for photo in self.photos]
         matcher = None if project.config.features == "sift" else self._matcher()
         with self.times.of("features"):
             self.report(f"looking for features in {len(names)} photos (masks: {self.inputs.kind})")
-            features.extract(project, self.photos, self.inputs.masks)
+            self._extract(project)
             if frames is not None:
                 known_poses.write_cameras(project, frames)
         with self.times.of("matching"):
@@ -220,7 +230,7 @@ class PoseSearch:
             return found, None
         self.report(f"few photos with little in common: looking thoroughly for features (masks: {self.inputs.kind})")
         project = replace(project, database=project.database.with_name("thorough.db"))
-        features.extract(project, self.photos, None, thorough=True)
+        self._extract(project, thorough=True)
         hypotheses = few_photos.match_few(project, self.inputs.masks, self.learned)
         lens = None if hypotheses.turning is None else one_lens(project)  # below, guesses replace its focal length
         look = SecondLook(project, hypotheses, lens)
@@ -268,15 +278,16 @@ class PoseSearch:
 
 
 def _holds_others(one: MappingResult, other: MappingResult) -> bool:
-    """True where one places as many photos as the other, with other poses, and more holds them, or where outlines hold
-    more photos about one axis."""
+    """True where one places more photos than the other and agrees with it, or as many, with other poses that more
+    holds, or where outlines hold more photos about one axis."""
     if one.mapper == TURNTABLE and len(one.names) > len(other.names):
         return True
     found = [dict(zip(*mapping.poses(mapped.reconstruction), strict=True)) for mapped in (one, other)]
     common = sorted(one.names & other.names)
     apart = turns_apart(*(np.array([viewmats[name] for name in common]).reshape(-1, 4, 4) for viewmats in found))
-    firmer = support(one.reconstruction) > support(other.reconstruction)
-    return len(one.names) >= len(other.names) and apart > MOST_APART and firmer
+    if apart <= MOST_APART:
+        return len(one.names) > len(other.names)
+    return len(one.names) >= len(other.names) and support(one.reconstruction) > support(other.reconstruction)
 
 
 def _learned_installed() -> bool:

@@ -37,13 +37,16 @@ class Database(SimpleNamespace):
         self.written.append((a, b, geometry))
 
 
-def cameras(*degrees: float) -> Any:
-    """Cameras at rest above the points, turned around them; the focal length is 300 px."""
+def cameras(*degrees: float, roll: float = 0.0) -> Any:
+    """Cameras at rest above the points, turned around them; the focal length is 300 px. The last one is rolled too."""
     made = pycolmap.Reconstruction()
     lens = pycolmap.Camera(model="PINHOLE", width=400, height=300, params=[300.0, 300, 200, 150], camera_id=1)
     made.add_camera_with_trivial_rig(lens)
     for number, angle in enumerate(np.radians(degrees), 1):
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, angle, 0])), np.array([0.0, 0, 5]))
+        turn = pycolmap.Rotation3d(np.array([0, angle, 0]))
+        if number == len(degrees):
+            turn = pycolmap.Rotation3d(np.array([0, 0, np.radians(roll)])) * turn
+        pose = pycolmap.Rigid3d(turn, np.array([0.0, 0, 5]))
         image = pycolmap.Image(name=f"{number}.png", camera_id=1, image_id=number)
         made.add_image_with_trivial_frame(image, pose)
     return made
@@ -66,10 +69,14 @@ def written(made: Any, pairs: PairMatches, descriptors: dict[int, np.ndarray], b
     return database.written
 
 
+@pytest.mark.parametrize("roll", [0, 90, 180])
 @pytest.mark.parametrize(("turn", "compared"), [(59.9, True), (60.5, False), (-59.9, True), (-60.5, False)])
-def test_photos_up_to_sixty_degrees_apart_are_matched_with_their_true_geometry(turn: float, compared: bool) -> None:
-    """All points look different, and each finds itself; what was verified before is forgotten."""
-    made = cameras(0, turn)
+def test_photos_that_look_up_to_sixty_degrees_apart_are_matched_with_their_true_geometry(
+    turn: float, roll: float, compared: bool
+) -> None:
+    """All points look different, and each finds itself; what was verified before is forgotten. A photo on its side or
+    on its head shows the same."""
+    made = cameras(0, turn, roll=roll)
     looks = dict.fromkeys((1, 2), np.eye(128, dtype=np.float32)[:COUNT])
     first, *found = written(made, seen(made, {}), looks)
     assert first == "cleared"
@@ -192,3 +199,16 @@ def test_a_feature_is_taken_in_its_own_photo_whatever_its_number_in_the_other_on
     new = np.array([[0, 3], [1, 2], [2, 0], [3, 1]], np.uint32)
     found = guided_matches._with_verified(new, pairs, (1, 2), level, 2.0)
     assert found.tolist() == [[0, 1], [1, 2], [2, 0]]
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 10**6])
+def test_partners_are_mutual_whatever_is_compared_at_once(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Feature n of the first photo is 39 - n of the second one. Two equal ones (0 and 1) share a partner: one has it."""
+    looks = np.abs(np.random.default_rng(3).normal(size=(40, 128))).astype(np.float32) ** 3
+    looks[1] = looks[0]
+    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+    points = np.stack([np.arange(40.0), np.full(40, 10.0)], axis=1)
+    level = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    monkeypatch.setattr(guided_matches, "ROWS_AT_ONCE", at_once)
+    found = guided_matches.guided(level, points, points[:39], looks, looks[::-1][:39], 2.0)
+    assert found.tolist() == [[0, 38], *([n, 39 - n] for n in range(2, 40))]

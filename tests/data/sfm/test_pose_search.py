@@ -43,7 +43,12 @@ def test_features_of_all_photos_are_found_inside_masks_and_matched_by_their_kind
         assert (given, threads) == (names, 3)
         return "learned"
 
-    monkeypatch.setattr(features, "extract", lambda project, photos, masks: steps.append((len(photos), masks.name)))
+    def extract(project: Any, photos: list[Any], masks: Path, *, thorough: bool) -> None:
+        assert not thorough
+        steps.append((len(photos), masks.name))
+        project.database.touch()
+
+    monkeypatch.setattr(features, "extract", extract)
     monkeypatch.setattr(known_poses, "write_cameras", lambda project, frames: steps.append(frames))
     monkeypatch.setattr(features, "match", lambda project, given, way, report: steps.append((given, way)) or "by SIFT")
     monkeypatch.setattr(run, "_matcher", lambda: "networks")
@@ -64,7 +69,7 @@ def test_a_second_look_is_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     nothing = FoundPoses(graph(CHAIN), None, "sift")
     monkeypatch.setattr(run, "_graph", lambda project, frames=None: graph({}))
     monkeypatch.setattr(run, "_mapped", lambda *_: None)
-    monkeypatch.setattr(features, "extract", lambda *_, **__: None)
+    monkeypatch.setattr(features, "extract", lambda project, *_, **__: project.database.touch())
     monkeypatch.setattr(few_photos, "trust", lambda *_: 0)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, graph({})))
@@ -158,19 +163,21 @@ def test_poses_are_other_ones_beyond_five_degrees_and_need_more_support_and_as_m
     assert pose_search._holds_others(result("one"), result("other")) == others
 
 
-@pytest.mark.parametrize(("mapper", "photos", "holds"), [("turntable", 6, True), ("few photos", 6, False)])
-def test_more_photos_about_one_axis_hold(
-    mapper: str, photos: int, holds: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("mapper", "apart", "holds"), [("turntable", 9.0, True), ("few photos", 9.0, False), ("few photos", 5.0, True)]
+)
+def test_more_photos_about_one_axis_or_with_the_same_poses_hold(
+    mapper: str, apart: float, holds: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mapping, "poses", lambda names: (sorted(names), np.zeros((len(names), 4, 4))))
-    monkeypatch.setattr(pose_search, "turns_apart", lambda *_: 0.0)
-    monkeypatch.setattr(pose_search, "support", len)
+    monkeypatch.setattr(pose_search, "turns_apart", lambda *_: apart)
+    monkeypatch.setattr(pose_search, "support", lambda names: -len(names))
 
     def result(count: int, mapper: str) -> Any:
         names = {str(n) for n in range(count)}
         return SimpleNamespace(reconstruction=names, names=names, mapper=mapper)
 
-    assert pose_search._holds_others(result(photos, mapper), result(5, "few photos")) == holds
+    assert pose_search._holds_others(result(6, mapper), result(5, "few photos")) == holds
     assert not pose_search._holds_others(result(5, mapper), result(5, "few photos"))
 
 
@@ -181,9 +188,9 @@ def test_more_photos_about_one_axis_hold(
 def test_one_look_is_enough_where_150_points_place_all_photos_and_no_outline_contradicts_them(
     placed: int, trust: int, misses: float | None, enough: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks: list[str] = []
+    looks: list[None] = []
     run = search(tmp_path, [])
-    monkeypatch.setattr(features, "extract", lambda *_, **__: looks.append("again"))
+    monkeypatch.setattr(features, "extract", lambda project, *_, **__: looks.append(project.database.touch()))
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, graph({})))
@@ -191,4 +198,24 @@ def test_one_look_is_enough_where_150_points_place_all_photos_and_no_outline_con
     first: Any = SimpleNamespace(names={f"{i}.png" for i in range(placed)}, reconstruction=None)
     found = FoundPoses(graph(CHAIN), first, "sift")
     assert run._few(run._project(tmp_path, "sift"), found)[0] is found
-    assert looks == ([] if enough else ["again"])
+    assert len(looks) == (not enough)
+
+
+def test_features_are_found_once_for_each_kind_of_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written into a copy later is not in the next one."""
+    looks: list[tuple[bool, bool]] = []
+
+    def extract(project: Any, photos: list[Any], masks: Path | None, *, thorough: bool) -> None:
+        looks.append((thorough, masks is None))
+        project.database.write_text(f"thorough {thorough}")
+
+    monkeypatch.setattr(features, "extract", extract)
+    run = search(tmp_path, [])
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        folder.mkdir()
+        for thorough in (False, True):
+            project = run._project(folder, "both")
+            run._extract(project, thorough=thorough)
+            assert project.database.read_text() == f"thorough {thorough}"
+            project.database.write_text("matches")
+    assert looks == [(False, False), (True, True)]

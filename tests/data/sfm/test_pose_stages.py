@@ -86,9 +86,12 @@ def test_points_seen_from_one_side_or_far_from_their_pixels_are_left_out(off: fl
 
 def test_a_second_look_is_thorough(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     looks: list[bool] = []
-    monkeypatch.setattr(
-        pose_search.features, "extract", lambda project, photos, masks, thorough=False: looks.append(thorough)
-    )
+
+    def extract(project: Any, photos: list[Any], masks: Path | None, *, thorough: bool) -> None:
+        looks.append(thorough)
+        project.database.touch()
+
+    monkeypatch.setattr(pose_search.features, "extract", extract)
     nothing = SimpleNamespace(matches=[], turntable=False, turning=None)
     monkeypatch.setattr(few_photos, "trust", lambda *_: 0)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: nothing)
@@ -113,7 +116,7 @@ def second_look(
     looks: list[Any] = [
         None if n is None else SimpleNamespace(names=[""] * n, reconstruction=row) for row, n in enumerate(placed)
     ]
-    monkeypatch.setattr(pose_search.features, "extract", lambda *_, **__: None)
+    monkeypatch.setattr(pose_search.features, "extract", lambda project, *_, **__: project.database.touch())
     monkeypatch.setattr(pose_search, "outline_misses", lambda reconstruction, *_: misses[reconstruction])
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True, turning=None))
