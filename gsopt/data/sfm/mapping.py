@@ -49,9 +49,9 @@ MAX_OFF_CENTER = 0.03
 shift of all photos looks like a turn of all cameras: 13 % and 5 degrees on a rendered orbit."""
 
 
-LENSES = (0.25, 5.0)
+LENSES = (0.25, 8.0)
 """Shortest and longest focal length that is believed where EXIF names none, in longer sides of the photo: a fisheye's,
-a telephoto's. Wrong matches make it grow without end: 10 and 33 where the camera had 0.75."""
+that of a lens of 290 mm on full frame. Wrong matches make it grow without end: 10 and 33 where the camera had 0.75."""
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,7 @@ def test_a_feature_is_taken_in_its_own_photo_whatever_its_number_in_the_other_on
 
 @pytest.mark.parametrize("at_once", [1, 7, 10**6])
 def test_partners_are_mutual_whatever_is_compared_at_once(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Feature n of the first photo is 39 - n of the second one. Two equal ones (0 and 1) share a partner: one has it."""
+    """Feature n of one photo is 39 - n of the other. Two equal ones (0 and 1) share a partner, and one has it."""
     looks = np.abs(np.random.default_rng(3).normal(size=(40, 128))).astype(np.float32) ** 3
     looks[1] = looks[0]
     looks /= np.linalg.norm(looks, axis=1, keepdims=True)

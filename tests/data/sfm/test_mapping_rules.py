@@ -187,8 +187,8 @@ def test_another_mapper_is_tried_where_less_than_nine_tenths_are_placed(
     [
         (0.25, False, None, True),
         (0.24, False, None, False),
-        (5.0, False, None, True),
-        (5.1, False, None, False),
+        (8.0, False, None, True),
+        (8.1, False, None, False),
         (33.0, False, None, False),
         (33.0, True, None, True),
         (33.0, False, 13200.0, True),
