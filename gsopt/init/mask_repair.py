@@ -1,5 +1,7 @@
 """Repair of masks that disagree with the others: the hull of the others says where, the colors say what.
 
+Parts of an agreeing mask that this hull does not touch are no part of the object, and are cut off.
+
 Within the projection of the hull a pixel belongs to the object where its color is more frequent in the agreeing
 silhouettes than in this photo's surroundings; pixels without an edge between them go the same way. If the outcome
 disagrees again, the whole projection is taken: it can carve nothing away.
@@ -19,7 +21,7 @@ from gsopt.config.train import DataConfig
 from gsopt.data.scene import PixelStore, Scene, View, load_scene
 from gsopt.geometry.focus import find_focus
 from gsopt.init.mask_agreement import MIN_COVERED, MIN_MASKS, Agreement, has_edge, mask_agreement
-from gsopt.init.mask_parts import cleaned
+from gsopt.init.mask_parts import cleaned, labels
 from gsopt.init.random_walker import walked
 from gsopt.init.thumbnails import Thumbnail, small_photos
 
@@ -42,8 +44,10 @@ KINDS = {
     "empty": "it is empty",
     "too large": "it shows more than the object",
     "lost": "it lacks a part of the object",
+    "stray": "it shows pieces beside the object",
 }
 REPAIRS = {
+    "freed": "freed of the pieces that the hull of the others does not touch",
     "colors": "found again by color inside the hull of the others",
     "cleared": "cleared, since the hull of the others lies outside the photo, which does not show the object",
     "hull": "replaced by the projected hull of the others, since colors do not tell the object from its surroundings",
@@ -98,10 +102,13 @@ def load_with_agreeing_masks(config: DataConfig) -> tuple[Scene, list[RepairedMa
     agree, or where nothing tells the wrong ones."""
     scene = load_scene(config)
     agreement = agreement_of(scene)
-    if agreement is None or not agreement.disagreeing:
+    if agreement is None:
+        return scene, []
+    found = _freed(scene.train, agreement)
+    if not found and not agreement.disagreeing:
         return scene, []
     unmasked = load_scene(replace(config, masks="none")).train
-    found = _repaired(scene.train, unmasked, agreement)
+    found |= _repaired(scene.train, unmasked, agreement)
     alphas = {scene.train[row].index: alpha for row, (alpha, _) in found.items()}
     store = RepairedAlphas(scene.train[0].store, unmasked[0].store, alphas)
     views = tuple(replace(view, store=store) for view in scene.train)
@@ -115,6 +122,22 @@ def agreement_of(scene: Scene) -> Agreement | None:
         return None
     photos = small_photos(scene.train, MAX_CHECKED)
     return mask_agreement(photos, find_focus([photo.camera for photo in photos], scene.extent))
+
+
+def _freed(views: tuple[View, ...], agreement: Agreement) -> dict[int, tuple[UInt8[Tensor, "H W"], RepairedMask]]:
+    """Alphas of agreeing views without the parts that the hull of the others does not touch, which networks leave
+    beside an object: too small to disagree, but a photo's colors would hang in the air there. By row."""
+    found = {}
+    for row in agreement.agreeing:
+        shown = agreement.photos[row].planes[3] > 0
+        parts = labels(shown)
+        stray = shown & ~torch.isin(parts, parts[agreement.projection(row)])
+        if not bool(stray.any()):
+            continue
+        alpha = views[row].pixels()[..., 3].clone()
+        alpha[_enlarged(stray, *alpha.shape) > 0] = 0
+        found[row] = alpha, RepairedMask(views[row].name, "stray", agreement.covered[row], "freed")
+    return found
 
 
 def _repaired(

@@ -173,3 +173,38 @@ def test_a_ray_is_as_thick_as_its_way_through_the_hull(tmp_path: Path) -> None:
     expected = chord / chord[chord > 0].mean()
     assert float((thick - expected).abs()[chord > 0].mean()) < 0.3  # a hull of nine views, by a pixel's reach wider
     assert float(thick[offset > 0.8 / 4].abs().max()) == 0
+
+
+@pytest.mark.parametrize("count", [4, 6])
+def test_a_piece_beside_the_object_is_cut_off_and_named(tmp_path: Path, count: int) -> None:
+    """It is too small for its mask to disagree. All else of that mask, and the others, keep their bits."""
+    config = photos(tmp_path, count)
+    before = [view.pixels() for view in load_scene(config).train]
+    path = tmp_path / "masks" / "train" / f"r_{WRONG}.png"
+    mask = np.array(Image.open(path))
+    assert not mask[2:10, 2:10].any()
+    mask[4:7, 3:8] = 255
+    Image.fromarray(mask).save(path)
+    assert agreement(load_scene(config)).disagreeing == []
+    scene, (freed,) = load_with_agreeing_masks(config)
+    assert (freed.name, freed.kind, freed.repair) == (f"train/r_{WRONG}.png", "stray", "freed")
+    assert "shows pieces beside the object" in freed.about
+    for pixels, view in zip(before, scene.train, strict=True):
+        assert torch.equal(pixels[..., 3], view.pixels()[..., 3])
+
+
+def test_a_piece_and_a_wrong_mask_are_both_mended(tmp_path: Path) -> None:
+    config = photos(tmp_path, 8, "empty")
+    path = tmp_path / "masks" / "train" / "r_5.png"
+    mask = np.array(Image.open(path))
+    mask[4:7, 3:8] = 255
+    Image.fromarray(mask).save(path)
+    scene, found = load_with_agreeing_masks(config)
+    assert {(mask.name, mask.repair) for mask in found} == {("train/r_5.png", "freed"), ("train/r_2.png", "colors")}
+    assert not bool(scene.train[5].pixels()[2:9, 2:10, 3].any())
+
+
+def test_a_part_that_hangs_in_the_air_in_all_masks_stays(tmp_path: Path) -> None:
+    """Two balls apart are one object."""
+    config = photos(tmp_path, 6, balls=[Ball((-0.3, 0, 0), 0.4), Ball((0.5, 0.1, 0.3), 0.12)])
+    assert load_with_agreeing_masks(config)[1] == []
