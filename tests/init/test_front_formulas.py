@@ -153,7 +153,7 @@ def test_a_scene_whose_masks_agree_is_returned_as_it_was_read(
         masks: Scene("a", "b", tuple(View(f"{i}", camera, store, i + 5) for i in range(2)), (), None, False, ())  # type: ignore[arg-type]
         for masks, store in stores.items()
     }
-    agreement: Any = SimpleNamespace(disagreeing=disagreeing)
+    agreement: Any = SimpleNamespace(agreeing=[], disagreeing=disagreeing)
     alpha = torch.full((1, 1), 7, dtype=torch.uint8)
     monkeypatch.setattr(mask_repair, "load_scene", lambda config: scenes[config.masks])
     monkeypatch.setattr(mask_repair, "agreement_of", lambda scene: agreement)
