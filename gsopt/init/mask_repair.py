@@ -56,7 +56,7 @@ REPAIRS = {
 
 @dataclass(frozen=True)
 class RepairedMask:
-    """A mask that disagreed with the others."""
+    """A mask that disagreed with the others, or showed pieces beside the object."""
 
     name: str
     """Name of its view."""
@@ -126,7 +126,7 @@ def agreement_of(scene: Scene) -> Agreement | None:
 
 def _freed(views: tuple[View, ...], agreement: Agreement) -> dict[int, tuple[UInt8[Tensor, "H W"], RepairedMask]]:
     """Alphas of agreeing views without the parts that the hull of the others does not touch, which networks leave
-    beside an object: too small to disagree, but a photo's colors would hang in the air there. By row."""
+    beside an object: too small to disagree, but a photo's colors would hang in the air there. Returns them by row."""
     found = {}
     for row in agreement.agreeing:
         shown = agreement.photos[row].planes[3] > 0

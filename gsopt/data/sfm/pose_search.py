@@ -145,7 +145,8 @@ class PoseSearch:
             shutil.copyfile(kept, project.database)
             return
         features.extract(project, self.photos, None if thorough else self.inputs.masks, thorough=thorough)
-        shutil.copyfile(project.database, kept)
+        if len(self.photos) <= LEARNED_UP_TO:  # larger sets are looked at once, and their database is large
+            shutil.copyfile(project.database, kept)
 
     def _graph(self, project: ColmapProject, frames: list[PosedImage] | None = None) -> ViewGraph:
         names = [photo.name for photo in self.photos]

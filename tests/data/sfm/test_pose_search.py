@@ -202,7 +202,7 @@ def test_one_look_is_enough_where_150_points_place_all_photos_and_no_outline_con
 
 
 def test_features_are_found_once_for_each_kind_of_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is written into a copy later is not in the next one."""
+    """A search that writes matches into its database leaves the kept features alone."""
     looks: list[tuple[bool, bool]] = []
 
     def extract(project: Any, photos: list[Any], masks: Path | None, *, thorough: bool) -> None:
@@ -219,3 +219,13 @@ def test_features_are_found_once_for_each_kind_of_look(tmp_path: Path, monkeypat
             assert project.database.read_text() == f"thorough {thorough}"
             project.database.write_text("matches")
     assert looks == [(False, False), (True, True)]
+    assert (tmp_path / "features.db").is_file()
+
+
+def test_features_of_many_photos_are_kept_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their database can be large, and no second search needs it."""
+    monkeypatch.setattr(features, "extract", lambda project, *_, **__: project.database.touch())
+    monkeypatch.setattr(pose_search, "LEARNED_UP_TO", 5)
+    run = search(tmp_path, [])
+    run._extract(run._project(tmp_path, "sift"))
+    assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
