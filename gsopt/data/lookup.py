@@ -15,6 +15,7 @@ from torch import Tensor
 from gsopt.geometry.cameras import Cameras
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.cpu_backend import workspace
+from gsopt.raster.threads import preparing_threads
 
 
 @dataclass(frozen=True)
@@ -48,5 +49,5 @@ def lowest(
     (scene units) of the point."""
     values, shown = torch.empty(points.shape[:-1]), torch.empty(points.shape[:-1], dtype=torch.int32)
     parts = [picture.parts for picture in pictures]
-    _cpu.lookup(workspace(1), points.contiguous(), parts, beside, radius, enough, values, shown)
+    _cpu.lookup(workspace(preparing_threads()), points.contiguous(), parts, beside, radius, enough, values, shown)
     return values, shown

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -27,6 +29,7 @@ from gsopt.data.undistort import Undistortion, choose_pinhole
 from gsopt.errors import InputError, UsageError
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.voxels import Grid
+from gsopt.raster.threads import preparing_threads
 
 FAR_FROM_ORIGIN = 1e3
 """Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""
@@ -85,6 +88,19 @@ class Points:
 
 
 @dataclass(frozen=True)
+class AgreedPoints:
+    """Places on which at least two photos agree, and their colors."""
+
+    xyz: Float[Tensor, "N 3"]
+    rgb: Float[Tensor, "N 3"]
+    """0..1."""
+    photos: int
+    """Number of photos that were matched."""
+    share: float
+    """Share of their pixels on which another photo agrees."""
+
+
+@dataclass(frozen=True)
 class Scene:
     """All input data of a run. World frame as in the source, less `origin`."""
 
@@ -110,6 +126,8 @@ class Scene:
     """This shape, where something else than inflation found it (gsopt/shape_library, gsopt/shape_prior)."""
     body_colors: Float[Tensor, "X Y Z 3"] | None = None
     """Colors of its voxels (0..1) for the sides that no photo shows; without them the photo's go straight through."""
+    agreed: AgreedPoints | None = None
+    """Places on which the input views agree, once they were matched (gsopt/init/stereo)."""
 
     @property
     def observed(self) -> tuple[View, ...]:
@@ -139,6 +157,17 @@ class Scene:
         if self.points is None or len(self.points.xyz) == 0:
             return 1.0
         return max(float((self.points.xyz - centers.mean(0)).norm(dim=1).mean()), 1e-6)
+
+
+def read_ahead(views: Sequence[View]) -> None:
+    """Decode images side by side; the store keeps those that fit. InputError for the first that cannot be decoded."""
+
+    def read(view: View) -> None:
+        view.pixels()
+
+    with ThreadPoolExecutor(preparing_threads()) as pool:
+        for _ in pool.map(read, views):
+            pass
 
 
 def load_scene(config: DataConfig | str | Path) -> Scene:

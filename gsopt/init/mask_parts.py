@@ -24,6 +24,16 @@ def cleaned(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     return largest | ((around > 0) & filled[around])
 
 
+def touched(mask: Bool[Tensor, "H W"], seeds: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """The connected parts of a mask (8 neighbors) that have a seed: these spread in it until nothing changes."""
+    reached = mask & seeds
+    while True:
+        wide = torch.nn.functional.max_pool2d(reached[None, None].float(), 3, 1, 1)[0, 0].bool() & mask
+        if torch.equal(wide, reached):
+            return reached
+        reached = wide
+
+
 def labels(mask: Bool[Tensor, "H W"]) -> Int64[Tensor, "H W"]:
     """A number above 0 for each connected part (8 neighbors), 0 outside: the largest number of its pixels spreads until
     nothing changes."""

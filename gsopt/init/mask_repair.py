@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from gsopt.config.train import DataConfig
-from gsopt.data.scene import PixelStore, Scene, View, load_scene
+from gsopt.data.scene import PixelStore, Scene, View, load_scene, read_ahead
 from gsopt.geometry.focus import find_focus
 from gsopt.init.mask_agreement import MIN_COVERED, MIN_MASKS, Agreement, has_edge, mask_agreement
-from gsopt.init.mask_parts import cleaned, labels
+from gsopt.init.mask_parts import cleaned, touched
 from gsopt.init.random_walker import walked
 from gsopt.init.thumbnails import Thumbnail, small_photos
 
@@ -117,7 +117,10 @@ def load_with_agreeing_masks(config: DataConfig) -> tuple[Scene, list[RepairedMa
 
 def agreement_of(scene: Scene) -> Agreement | None:
     """The agreement of the input views' masks; Returns None where too few have one, or there are too many to check."""
-    masked = [view.pixels().shape[2] == 4 for view in scene.train] if len(scene.train) <= MAX_CHECKED else []
+    if len(scene.train) > MAX_CHECKED:
+        return None
+    read_ahead(scene.train)
+    masked = [view.pixels().shape[2] == 4 for view in scene.train]
     if sum(masked) < MIN_MASKS or 2 * sum(masked) <= len(masked):
         return None
     photos = small_photos(scene.train, MAX_CHECKED)
@@ -130,8 +133,7 @@ def _freed(views: tuple[View, ...], agreement: Agreement) -> dict[int, tuple[UIn
     found = {}
     for row in agreement.agreeing:
         shown = agreement.photos[row].planes[3] > 0
-        parts = labels(shown)
-        stray = shown & ~torch.isin(parts, parts[agreement.projection(row)])
+        stray = shown & ~touched(shown, agreement.projection(row))
         if not bool(stray.any()):
             continue
         alpha = views[row].pixels()[..., 3].clone()

@@ -15,6 +15,7 @@ from gsopt.geometry.voxels import Grid, dilated
 from gsopt.init.thumbnails import Thumbnail
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.cpu_backend import workspace
+from gsopt.raster.threads import preparing_threads
 from gsopt.symmetry.axis import Axis, perpendicular
 from gsopt.symmetry.mirror import Mirror
 from gsopt.symmetry.silhouettes import RayPoints, Silhouettes
@@ -118,7 +119,7 @@ def uncovered(
     pixels = [_pixels(photo, centers, grid.voxel) for photo in photos]
     lost = torch.empty(len(normals))
     wide = dilated(grid.occupied).view(torch.uint8)
-    _cpu.mirror(workspace(1), cells, normals.contiguous(), offsets, wide, pixels, lost)
+    _cpu.mirror(workspace(preparing_threads()), cells, normals.contiguous(), offsets, wide, pixels, lost)
     return lost
 
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ import torch
 
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
-from gsopt.data.scene import Scene, View
+from gsopt.data.scene import Scene, read_ahead
 from gsopt.errors import InputError, NumericalError, UsageError
 from gsopt.events import to_json, write_atomic
 from gsopt.formats import load_splats
@@ -28,7 +28,7 @@ from gsopt.init.mask_repair import RepairedMask, load_with_agreeing_masks
 from gsopt.raster.api import make_backend
 from gsopt.raster.backend import Backend
 from gsopt.raster.device.memory import PRIOR_BYTES, Memory, free_bytes, is_out_of_memory
-from gsopt.raster.threads import one_torch_thread
+from gsopt.raster.threads import available_cores, one_torch_thread
 from gsopt.training.checkpoint import load_newest, newest_saved, save_checkpoint
 from gsopt.training.estimate import estimate, memory_limit
 from gsopt.training.few_photos import few_photo_warnings
@@ -89,9 +89,9 @@ def train(
     began = time.process_time()
     with opened(Path(run), config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
         backend = make_backend(config.backend, config.threads, config.device)
-        with one_torch_thread(), on_its_gpu(backend):
+        with one_torch_thread(config.threads or available_cores()), on_its_gpu(backend):
             scene, repaired = load_with_agreeing_masks(config.data)
-            require_readable(scene.test)
+            read_ahead(scene.test)  # an image that cannot be decoded is named before the work that it is to evaluate
             scene = with_recorded_mirrors(config, scene, directory)
             if config.guidance != GuidanceConfig() or len(scene.train) == 1:
                 scene = _with_prior_body(config, scene, backend, directory)
@@ -137,12 +137,6 @@ def on_its_gpu(backend: Backend) -> Iterator[None]:
         return
     with torch.cuda.device(backend.device):
         yield
-
-
-def require_readable(views: Sequence[View]) -> None:
-    """Raise InputError for a held-out image that cannot be decoded, before the work that it is to evaluate."""
-    for view in views:
-        view.pixels()
 
 
 def _with_prior_body(config: TrainConfig, scene: Scene, backend: Backend, directory: RunDirectory) -> Scene:

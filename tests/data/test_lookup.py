@@ -13,6 +13,7 @@ from gsopt.geometry.cameras import Cameras, look_at
 from gsopt.geometry.projection import inside, project
 from gsopt.raster import _cpu  # type: ignore[attr-defined]
 from gsopt.raster.cpu_backend import workspace
+from gsopt.raster.threads import one_torch_thread, preparing_threads
 
 WIDTH, HEIGHT = 40, 30
 K = torch.tensor([[[50.0, 0, 19], [0, 45, 16], [0, 0, 1]]])
@@ -37,6 +38,26 @@ def random_points(count: int) -> torch.Tensor:
     """Half of them lie near the origin, where the camera looks, and some behind the camera."""
     points = torch.randn(count, 3, generator=torch.Generator().manual_seed(count))
     return torch.cat([points[::2] * 0.5, points[1::2] * 4])
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    """Of more points than one thread takes at once, the last of them alone."""
+    image = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    points = random_points(2 * 2048 + 1)
+    expected = lowest([Picture(CAMERA, image, unseen=-3.0)], points, beside=0.5, radius=0.1)
+    with one_torch_thread(3):
+        found = lowest([Picture(CAMERA, image, unseen=-3.0)], points, beside=0.5, radius=0.1)
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+
+
+def test_the_threads_that_prepare_a_scene_are_those_of_the_run_around() -> None:
+    assert preparing_threads() == 1
+    with one_torch_thread(3):
+        assert preparing_threads() == 3
+        with one_torch_thread():
+            assert preparing_threads() == 1
+        assert preparing_threads() == 3
+    assert preparing_threads() == 1
 
 
 @pytest.mark.parametrize("isa", _cpu.instruction_sets())

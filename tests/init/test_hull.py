@@ -19,6 +19,7 @@ from gsopt.geometry.voxels import Grid
 from gsopt.init import first_gaussians, hull
 from gsopt.init.hull import SURFACE_SHARE, HullPoints, carve, hull_points, in_hull
 from gsopt.init.thumbnails import Thumbnail, small_photos
+from gsopt.raster.threads import one_torch_thread
 
 CENTER, RADII = (0.3, -0.2, 0.1), (0.9, 0.6, 0.4)
 
@@ -108,16 +109,12 @@ def test_colors_are_those_of_the_nearest_surface(found: HullPoints) -> None:
 
 
 def test_the_hull_is_the_same_every_time_and_for_any_number_of_threads(scene: Scene, found: HullPoints) -> None:
-    threads = torch.get_num_threads()
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
+    for count in (1, 3):
+        with one_torch_thread(count):
             again = hull_points(scene, 4000, torch.Generator().manual_seed(0))
-            assert again is not None
-            assert torch.equal(again.xyz, found.xyz)
-            assert torch.equal(again.rgb, found.rgb)
-    finally:
-        torch.set_num_threads(threads)
+        assert again is not None
+        assert torch.equal(again.xyz, found.xyz)
+        assert torch.equal(again.rgb, found.rgb)
     other = hull_points(scene, 4000, torch.Generator().manual_seed(1))
     assert other is not None
     assert not torch.equal(other.xyz, found.xyz)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsopt.init.mask_parts import cleaned, labels
+from gsopt.init.mask_parts import cleaned, labels, touched
 from gsopt.init.mask_repair import RepairedMask, _bins, _enlarged, _histogram
 
 
@@ -40,6 +40,21 @@ def test_parts_that_touch_at_a_corner_are_one() -> None:
     assert found[6, 0] not in (0, int(found[1, 1]))
     assert torch.equal(found > 0, mask)
     assert int(cleaned(mask).sum()) == 8
+
+
+def test_parts_with_a_seed_are_kept_whole() -> None:
+    """A bent part with a seed at one end, another whose seed lies beside it, and a third that touches at a corner."""
+    mask = torch.zeros(9, 12, dtype=torch.bool)
+    mask[0, 0:8] = mask[0:9, 7] = mask[8, 0:8] = True
+    mask[3:5, 2:4] = True
+    mask[2, 8] = True
+    seeds = torch.zeros_like(mask)
+    seeds[0, 0] = seeds[4, 5] = True
+    expected = mask.clone()
+    expected[3:5, 2:4] = False
+    assert torch.equal(touched(mask, seeds), expected)
+    assert torch.equal(touched(mask, mask), mask)
+    assert not bool(touched(mask, torch.zeros_like(mask)).any())
 
 
 def test_colors_fall_into_sixteen_bins_along_each_channel() -> None:

@@ -17,7 +17,7 @@ from tiny_scenes import cloud, tiny_config
 from gsopt.config.cells import CellConfig
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import SparseConfig
-from gsopt.data.scene import Scene, load_scene
+from gsopt.data.scene import Scene, load_scene, read_ahead
 from gsopt.errors import InputError, NumericalError
 from gsopt.formats import load_splats
 from gsopt.formats.ply import save_ply
@@ -239,7 +239,7 @@ def test_held_out_images_are_read_before_the_work() -> None:
     read: list[str] = []
     views: Any = [SimpleNamespace(pixels=lambda: read.append("a")), SimpleNamespace(pixels=broken)]
     with pytest.raises(InputError, match=r"b\.png"):
-        loop.require_readable(views)
+        read_ahead(views)
     assert read == ["a"]
 
 
@@ -320,7 +320,7 @@ def test_a_single_photo_or_one_who_asks_gets_a_body_and_what_has_no_mirrors_gets
         raise Ended
 
     read: list[Any] = []
-    monkeypatch.setattr(loop, "require_readable", read.append)
+    monkeypatch.setattr(loop, "read_ahead", read.append)
     monkeypatch.setattr(loop, "load_with_agreeing_masks", lambda data: (scene, []))
     monkeypatch.setattr(loop, "with_recorded_mirrors", lambda config, scene, directory: scene)
     monkeypatch.setattr(loop, "_with_prior_body", lambda config, scene, *_: (done.append("body"), scene)[1])

@@ -7,19 +7,15 @@ from dataclasses import replace
 import torch
 
 from gsopt.data.scene import Scene
-from gsopt.geometry.focus import find_focus
-from gsopt.init.stereo.points import MAX_PHOTOS, agreed, plane_maps
-from gsopt.init.thumbnails import small_photos
+from gsopt.init.stereo.points import match_photos
 
 
 def with_stereo_depths(scene: Scene, least_agreed: float, seed: int) -> Scene:
-    """The scene with the inverse depths of each pixel on which another photo agrees; as it is where photos agree on
-    less than the share `least_agreed` of their pixels, as they do by chance."""
-    photos = small_photos(scene.train, MAX_PHOTOS)
-    focus = find_focus([view.camera for view in scene.train], scene.extent)
-    maps = plane_maps(photos, focus, torch.Generator().manual_seed(seed))
-    kept = [agreed(each, [other for other in maps if other is not each]) for each in maps]
-    if sum(int(keep.sum()) for keep in kept) < least_agreed * sum(keep.numel() for keep in kept):
+    """The scene with the points on which photos agree, and the inverse depths of the pixels that show them; without
+    depths where photos agree on less than the share `least_agreed` of their pixels, as they do by chance."""
+    found = match_photos(scene, torch.Generator().manual_seed(seed))
+    scene = replace(scene, agreed=found.points())
+    if scene.agreed is None or scene.agreed.share < least_agreed:
         return scene
-    depths = [each.inverse_depths().masked_fill(~keep, torch.nan) for each, keep in zip(maps, kept, strict=True)]
-    return replace(scene, train=tuple(replace(v, depth=d) for v, d in zip(scene.train, depths, strict=True)))
+    views = zip(scene.train, found.depths(), strict=True)
+    return replace(scene, train=tuple(replace(view, depth=depth) for view, depth in views))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gsopt.data.scene import Scene
+from gsopt.data.scene import AgreedPoints, Scene
 from gsopt.geometry.focus import Focus, find_focus
 from gsopt.geometry.projection import inside, project
 from gsopt.init.stereo.image import StereoImage
@@ -17,6 +17,7 @@ from gsopt.init.stereo.matching import Matcher
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
 from gsopt.init.thumbnails import Thumbnail, small_photos
 from gsopt.raster.cpu_backend import workspace
+from gsopt.raster.threads import preparing_threads
 
 MAX_PHOTOS = 16
 """Photos that are matched, the farthest apart."""
@@ -33,37 +34,47 @@ only turns measures no depth."""
 
 
 @dataclass(frozen=True)
-class StereoPoints:
-    """Points on surfaces, and their colors."""
+class StereoMaps:
+    """The planes that photos show, and where others confirm them."""
 
-    xyz: Float[Tensor, "N 3"]
-    rgb: Float[Tensor, "N 3"]
-    """0..1."""
-    photos: int
-    """Number of photos that were matched."""
-    share: float
-    """Share of their pixels on which another photo agrees."""
+    maps: list[PlaneMap]
+    kept: list[Bool[Tensor, "H W"]]
+
+    def depths(self) -> list[Float[Tensor, "H W"]]:
+        """Inverse depth along the camera's axis, NaN where no other photo agrees."""
+        return [found.inverse_depths().masked_fill(~keep, torch.nan) for found, keep in self._pairs()]
+
+    def points(self) -> AgreedPoints:
+        """One for every pixel on which another photo agrees."""
+        xyz = [found.image.points(found.inverse_depths())[keep] for found, keep in self._pairs()]
+        rgb = [found.image.rgb.permute(1, 2, 0)[keep] for found, keep in self._pairs()]
+        nothing = torch.empty(0, 3)
+        agreed, pixels = torch.cat([*xyz, nothing]), sum(keep.numel() for keep in self.kept)
+        return AgreedPoints(agreed, torch.cat([*rgb, nothing]), len(self.maps), len(agreed) / max(1, pixels))
+
+    def _pairs(self) -> Iterator[tuple[PlaneMap, Bool[Tensor, "H W"]]]:
+        return zip(self.maps, self.kept, strict=True)
 
 
-def stereo_points(scene: Scene, count: int, generator: torch.Generator) -> StereoPoints:
+def stereo_points(scene: Scene, count: int, generator: torch.Generator) -> AgreedPoints:
     """Up to `count` of the places on which photos agree, drawn at random. Fewer than two photos agree on none."""
+    found = scene.agreed or match_photos(scene, generator).points()
+    chosen = torch.randperm(len(found.xyz), generator=generator)[:count]
+    return replace(found, xyz=found.xyz[chosen], rgb=found.rgb[chosen])
+
+
+def match_photos(scene: Scene, generator: torch.Generator) -> StereoMaps:
+    """Matches the input views with each other; a single one has none to be matched with."""
     photos = small_photos(scene.train, MAX_PHOTOS)
     focus = find_focus([view.camera for view in scene.train], scene.extent)
     maps = plane_maps(photos, focus, generator) if len(photos) > 1 else []
-    kept = [agreed(each, [other for other in maps if other is not each]) for each in maps]
-    nothing = torch.empty(0, 3)
-    xyz = [each.image.points(each.inverse_depths())[keep] for each, keep in zip(maps, kept, strict=True)]
-    rgb = [each.image.rgb.permute(1, 2, 0)[keep] for each, keep in zip(maps, kept, strict=True)]
-    found = torch.cat([*xyz, nothing])
-    chosen = torch.randperm(len(found), generator=generator)[:count]
-    share = len(found) / max(1, sum(keep.numel() for keep in kept))
-    return StereoPoints(found[chosen], torch.cat([*rgb, nothing])[chosen], len(photos), share)
+    return StereoMaps(maps, [agreed(each, [other for other in maps if other is not each]) for each in maps])
 
 
 def plane_maps(photos: Sequence[Thumbnail], focus: Focus, generator: torch.Generator) -> list[PlaneMap]:
     """The planes that the pixels of each photo show, confirmed by others or not."""
     reach = Reach(1 / (FAR_DEPTH * focus.distance), 1 / (NEAR_DEPTH * focus.distance))
-    threads = workspace(torch.get_num_threads())
+    threads = workspace(preparing_threads())
     maps: list[PlaneMap] = []
     for pixels, rounds, shake in LEVELS:
         images = [StereoImage.of(photo, pixels) for photo in photos]

@@ -225,7 +225,7 @@ struct Kernels {
   void (*adam)(Pool&, const AdamArguments&);
   void (*match)(Pool&, const MatchArguments&);
   void (*distance)(const DistanceArguments&);
-  void (*lookup)(const LookupArguments&);
+  void (*lookup)(Pool&, const LookupArguments&);
   void (*mirror)(Pool&, const MirrorArguments&);
   Calibration (*calibrate)();
 };

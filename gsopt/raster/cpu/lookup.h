@@ -1,7 +1,11 @@
 // The lowest of the values that several pictures have at points of the scene (gsopt/data/lookup.py): projection and
 // bilinear interpolation in one pass, eight points at a time.
 #pragma once
+#include <algorithm>
+#include <cstring>
+
 #include "frame.h"
+#include "parallel.h"
 #include "simd.h"
 
 namespace gsopt::GSOPT_ISA {
@@ -61,15 +65,20 @@ inline Place lowest(const LookupArguments& m, const float* points) {
   return {found.value, -found.shown};
 }
 
-inline void lookup_stage(const LookupArguments& m) {
-  for (int64_t at = 0; at < m.count; at += 8) {
-    const int64_t lanes = m.count - at < 8 ? m.count - at : 8;
-    float last[24] = {};
-    if (lanes < 8) std::memcpy(last, m.points + 3 * at, sizeof(float) * 3 * lanes);
-    const Place found = lowest(m, lanes < 8 ? last : m.points + 3 * at);
-    std::memcpy(m.values + at, &found.value, sizeof(float) * lanes);
-    std::memcpy(m.shown + at, &found.shown, sizeof(int32_t) * lanes);
-  }
+constexpr int64_t kPointsAtOnce = 2048;
+
+inline void lookup_stage(Pool& pool, const LookupArguments& m) {
+  parallel(pool, divide_up(m.count, kPointsAtOnce), [&](int item, int) {
+    const int64_t first = item * kPointsAtOnce, end = std::min(m.count, first + kPointsAtOnce);
+    for (int64_t at = first; at < end; at += 8) {
+      const int64_t lanes = std::min<int64_t>(8, end - at);
+      float last[24] = {};
+      if (lanes < 8) std::memcpy(last, m.points + 3 * at, sizeof(float) * 3 * lanes);
+      const Place found = lowest(m, lanes < 8 ? last : m.points + 3 * at);
+      std::memcpy(m.values + at, &found.value, sizeof(float) * lanes);
+      std::memcpy(m.shown + at, &found.shown, sizeof(int32_t) * lanes);
+    }
+  });
 }
 
 }  // namespace gsopt::GSOPT_ISA

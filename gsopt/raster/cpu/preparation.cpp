@@ -70,7 +70,7 @@ void lookup(Workspace& ws, In points, const std::vector<PictureParts>& parts, st
       static_cast<int>(pictures.size()), !beside, radius, beside.value_or(0), enough, values.data(),
       data_of(shown, count, "shown")};
   nb::gil_scoped_release release;
-  timed(ws, "lookup", [&] { ws.kernels->lookup(a); });
+  timed(ws, "lookup", [&] { ws.kernels->lookup(ws.pool, a); });
 }
 
 // Voxels that a photo shows, the pixel of each, and the number of pixels.

@@ -14,7 +14,7 @@ import torch
 from gsopt.config.cells import CellConfig
 from gsopt.config.guidance import GuidanceConfig
 from gsopt.config.train import TrainConfig
-from gsopt.data.scene import Scene
+from gsopt.data.scene import Scene, read_ahead
 from gsopt.errors import InputError, UsageError, shortened
 from gsopt.farm.open import open_farm
 from gsopt.formats import load_splats
@@ -29,7 +29,7 @@ from gsopt.training.cells.plan import CellPlan, read_plan, sha256
 from gsopt.training.cells.size import cell_sizes
 from gsopt.training.cells.stages import FROZEN, START, Stages, cell_stage, coarse_stage, polish_stage
 from gsopt.training.interrupt import Stopped, StopRequest
-from gsopt.training.loop import TrainResult, peak_memory_mb, require_readable
+from gsopt.training.loop import TrainResult, peak_memory_mb
 from gsopt.training.plan import RunPlan
 from gsopt.training.run_directory import Listener, RunDirectory, make_folder, opened
 
@@ -48,7 +48,7 @@ def train_in_cells(
     workers = open_farm(farm, threads)
     with opened(run, config, resume, on_progress) as directory, StopRequest(directory.stop_file) as stop:
         scene, _ = load_with_agreeing_masks(replace(config.data, cache_mb=min(CACHE_MB, config.data.cache_mb)))
-        require_readable(scene.test)
+        read_ahead(scene.test)
         count, polished, max_gaussians = _sizes(config, scene, directory)
         stages = Stages(directory, workers, stop, threads)
         try:

@@ -11,15 +11,17 @@ import torch
 from rooms import distance_to_the_room, room_scene
 
 from gsopt.config.train import InitConfig
-from gsopt.data.scene import Scene
+from gsopt.data.scene import AgreedPoints, Scene
 from gsopt.errors import UsageError
 from gsopt.init import first_gaussians
-from gsopt.init.stereo import StereoPoints, stereo_points
+from gsopt.init.stereo import stereo_points
+from gsopt.init.stereo.depths import with_stereo_depths
+from gsopt.raster.threads import one_torch_thread
 
 COUNT = 4000
 
 
-def points_of(scene: Scene, seed: int = 0) -> StereoPoints:
+def points_of(scene: Scene, seed: int = 0) -> AgreedPoints:
     return stereo_points(scene, COUNT, torch.Generator().manual_seed(seed))
 
 
@@ -48,16 +50,25 @@ def test_points_have_the_colors_of_the_photos(scene: Scene) -> None:
 
 
 def test_the_same_bits_for_any_number_of_threads(scene: Scene) -> None:
-    before = torch.get_num_threads()
-    try:
-        runs = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
+    runs = []
+    for threads in (1, 3):
+        with one_torch_thread(threads):
             runs.append(points_of(scene))
-    finally:
-        torch.set_num_threads(before)
     assert torch.equal(runs[0].xyz, runs[1].xyz)
     assert torch.equal(runs[0].rgb, runs[1].rgb)
+
+
+def test_photos_that_were_matched_are_not_matched_again(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    matched = with_stereo_depths(scene, 0.05, seed=0)
+    assert matched.agreed is not None
+    monkeypatch.setattr("gsopt.init.stereo.points.match_photos", pytest.fail)
+    found = points_of(matched)
+    assert len(found.xyz) == COUNT
+    assert (found.photos, found.share) == (4, matched.agreed.share)
+    every = torch.cat([matched.agreed.xyz, matched.agreed.rgb], 1)
+    drawn = torch.cat([found.xyz, found.rgb], 1)
+    assert len(torch.cat([every, drawn]).unique(dim=0)) == len(every.unique(dim=0)), "some of them, in their colors"
+    assert not torch.equal(found.xyz, matched.agreed.xyz[:COUNT]), "at random"
 
 
 def test_photos_of_different_rooms_agree_on_next_to_nothing(tmp_path: Path) -> None:
