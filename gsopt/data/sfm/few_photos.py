@@ -7,7 +7,9 @@ few of them each decision of an incremental mapper counts.
 
 from __future__ import annotations
 
+import itertools
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,8 +49,11 @@ MIN_OBSERVATIONS = 100
 """Points seen by the median photo below which poses are no better than a guess: 4 of 8 photos of a museum head with 86
 were turned by 3 to 70 degrees, 10 of 12 with 256 by 1.4."""
 MIN_CONFIRMED = 50
-"""Points seen by three photos or more that must hold a photo where learned features were matched. 4 of 8 photos of the
-head with 10 to 29 were turned by up to 57 degrees, their mean error 0.6 px."""
+"""Points seen by three photos or more, or by two of three that share points pair by pair, that must hold a photo where
+learned features were matched. 4 of 8 photos of the head with 10 to 29 were turned by up to 57 degrees, their mean error
+0.6 px."""
+MIN_SHARED = 30
+"""Points that two photos share, from which on their pair counts as one side of a triangle."""
 MIN_TURN = 6.0
 """Degrees by which an object on a turntable turns at least; what turns less is a reflection or the room."""
 AMPLE_OBSERVATIONS = 400
@@ -145,20 +150,34 @@ def observations(reconstruction: Any) -> int:
 
 
 def keep_confirmed(reconstruction: Any) -> None:
-    """Takes back the poses of photos that too few points hold which a second and a third photo see too.
+    """Takes back the poses of photos that too few points hold which something else checks.
 
-    Points of two photos fit wherever the second one stands along its baseline: nothing checks them.
+    Points of two photos fit wherever the second one stands along its baseline. A third photo that sees them fixes that,
+    and so do three photos any two of which share points: their baselines form a triangle.
     """
     while True:
-        seen = dict.fromkeys(reconstruction.reg_image_ids(), 0)
-        for point in reconstruction.points3D.values():
-            photos = {element.image_id for element in point.track.elements}
-            for number in photos if len(photos) > 2 else ():
-                seen[number] += 1
+        tracks = [
+            sorted({element.image_id for element in point.track.elements}) for point in reconstruction.points3D.values()
+        ]
+        shared = Counter(pair for photos in tracks for pair in itertools.combinations(photos, 2))
+        sides = sides_of_triangles({pair for pair, count in shared.items() if count >= MIN_SHARED})
+        seen = Counter(dict.fromkeys(reconstruction.reg_image_ids(), 0))
+        for photos in tracks:
+            if len(photos) > 2 or tuple(photos) in sides:
+                seen.update(photos)
         weakest = min(seen, key=lambda number: (seen[number], number), default=None)
         if weakest is None or seen[weakest] >= MIN_CONFIRMED:
             return
         reconstruction.deregister_frame(reconstruction.image(weakest).frame_id)
+
+
+def sides_of_triangles(pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """The pairs (smaller number first) whose two photos each make another pair with the same third one."""
+    partners: dict[int, set[int]] = {}
+    for a, b in pairs:
+        partners.setdefault(a, set()).add(b)
+        partners.setdefault(b, set()).add(a)
+    return {(a, b) for a, b in pairs if partners[a] & partners[b]}
 
 
 def trust(project: ColmapProject, mapped: MappingResult | None) -> int:

@@ -19,8 +19,9 @@ from gsopt.data.sfm.pair_matches import PairMatches
 
 BANDS = (0.006,)
 """Distance from the epipolar line in which partners are looked for, round by round, a share of the diagonal."""
-MAX_TURN_DEGREES = 60.0
-"""Photos whose directions differ more show other sides."""
+MAX_TURN_DEGREES, LEAST_FAR = 60.0, 18
+"""Photos whose directions differ more show other sides: partners are not looked for, and earlier matches are kept from
+this number on, as of what lies flat on a table."""
 RATIO = 0.85
 MAX_DISTANCE = 0.75
 """Farthest two descriptors may be apart, of unit length."""
@@ -68,18 +69,16 @@ def _write_guided(project: ColmapProject, pairs: PairMatches, model: Any, descri
             for b in placed[i + 1 :]:
                 first, second = model.image(a), model.image(b)
                 relative = second.cam_from_world() * first.cam_from_world().inverse()
-                if relative.rotation.matrix()[2, 2] < np.cos(
-                    np.radians(MAX_TURN_DEGREES)
-                ):  # a rolled camera sees the same
-                    continue
+                near = relative.rotation.matrix()[2, 2] >= np.cos(np.radians(MAX_TURN_DEGREES))  # rolled or not
                 fundamental = fundamental_matrix(
                     relative, model.camera(first.camera_id), model.camera(second.camera_id)
                 )
                 points = pairs.keypoints[a][: len(descriptors[a])], pairs.keypoints[b][: len(descriptors[b])]
                 limit = band * float(np.hypot(*pairs.sizes[a]))
-                rows = guided(fundamental, *points, descriptors[a], descriptors[b], limit)
+                looks = (descriptors[a], descriptors[b]) if near else (descriptors[a][:0], descriptors[b][:0])
+                rows = guided(fundamental, *points, *looks, limit)
                 rows = _with_verified(rows, pairs, (a, b), fundamental, limit)
-                if len(rows) == 0:
+                if len(rows) < (1 if near else LEAST_FAR):
                     continue
                 geometry = pycolmap.TwoViewGeometry()
                 geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED

@@ -33,7 +33,7 @@ MIN_LOOKALIKES = 20
 class Matcher(Protocol):
     """A detector and matcher of features; a test has one without networks."""
 
-    def features(self, pixels: Any, mask: Any = None) -> LearnedFeatures: ...
+    def features(self, pixels: Any, mask: Any = None, *, turned: bool = False) -> LearnedFeatures: ...
 
     def match(self, first: LearnedFeatures, second: LearnedFeatures) -> Matches: ...
 
@@ -47,9 +47,17 @@ class LearnedMatches:
 
 
 def learned_matches(
-    matcher: Matcher, photos: Path, masks: Path | None, names: Sequence[str], threads: int, report: Report
+    matcher: Matcher,
+    photos: Path,
+    masks: Path | None,
+    names: Sequence[str],
+    threads: int,
+    report: Report,
+    *,
+    turned: bool,
 ) -> LearnedMatches:
-    """Matches of the photos that look alike: of the whole photos, and again of the objects that masks cut out.
+    """Matches of the photos that look alike: of the whole photos (`turned`: by quarters too), and again of the objects
+    that masks cut out.
 
     Cut out, an object fills the picture, so that more and finer features lie on it. The work of each photo and of each
     pair is done by one thread, which keeps the bits for any number of them.
@@ -58,7 +66,8 @@ def learned_matches(
     matches: dict[Pair, Matches] = {}
     for kind in ("whole photos",) if masks is None else ("whole photos", "objects in the masks"):
         folder = masks if kind != "whole photos" else None
-        found = _each(partial(_features, matcher, photos, folder), names, threads)
+        turns = turned and folder is None
+        found = _each(partial(_features, matcher, photos, folder, turns), names, threads)
         features = dict(zip(names, found, strict=True))
         pairs = alike(features)
         rows = _each(partial(_matched, matcher, features), pairs, threads)
@@ -135,13 +144,13 @@ def _append_keypoints(db: Any, number: int, keypoints: Points) -> int:
     return len(before)
 
 
-def _features(matcher: Matcher, photos: Path, masks: Path | None, name: str) -> LearnedFeatures:
+def _features(matcher: Matcher, photos: Path, masks: Path | None, turned: bool, name: str) -> LearnedFeatures:
     """Features of a photo, inside its mask where `masks` has one."""
     with Image.open(photos / name, formats=IMAGE_FORMATS) as image:
         pixels = np.asarray(image.convert("RGB"))
     path = None if masks is None else masks / f"{name}.png"
     if path is None or not path.is_file():
-        return matcher.features(pixels)
+        return matcher.features(pixels, turned=turned)
     with Image.open(path, formats=IMAGE_FORMATS) as image:
         return matcher.features(pixels, np.asarray(image.convert("L")) > 127)
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,16 @@ STRONGEST = 1024
 """Features of a photo that the cheap comparison looks at."""
 CANDIDATES = 4
 """Features that are looked for, as a multiple of MAX_KEYPOINTS, where a mask leaves some out."""
+TURN_STRONGEST, LEAST_TURNED = 1024, 16
+"""Features by which quarter turns are judged, and matches among them from which on one counts. Two photos of a notebook
+on a table have at most 13 in a wrong turn."""
 MARGIN = 0.02
 """Border around what a mask shows, a share of the longer side."""
 STEP = 32
 """Smallest side that the extractor takes, px."""
+OFFSET = (0.45, -1.55)
+"""Places at which the extractor finds a corner, less where it is, px to the right and down of the photo that it sees. A
+photo and the same one turned by quarters tell: 0.4 to 0.5 and -1.4 to -1.6 for each of seven photos by five cameras."""
 MAX_WEIGHT_BYTES = 1 << 28
 WEIGHTS = {
     "xfeat.pt": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
@@ -54,6 +61,22 @@ class LearnedFeatures:
     """Unit vectors."""
     size: tuple[int, int]
     """Width and height of the photo, px."""
+    turned: tuple[Float32[np.ndarray, "F 64"], ...] = ()
+    """Descriptors of the same places in the photo turned to the left by one, two and three quarters, or nothing."""
+
+    def strongest(self, most: int) -> LearnedFeatures:
+        """The first, which are the strongest, at most so many."""
+        turned = tuple(rows[:most] for rows in self.turned)
+        return LearnedFeatures(self.keypoints[:most], self.descriptors[:most], self.size, turned)
+
+    def turns(self) -> Iterator[LearnedFeatures]:
+        """The features in the photo as it is, and in each photo turned to the left, with the same rows."""
+        yield replace(self, turned=())
+        keypoints, (width, height) = self.keypoints, self.size
+        for descriptors in self.turned:
+            keypoints = np.stack([keypoints[:, 1], width - keypoints[:, 0]], 1)
+            width, height = height, width
+            yield LearnedFeatures(keypoints, descriptors, (width, height))
 
 
 class LearnedMatcher:
@@ -76,9 +99,10 @@ class LearnedMatcher:
         self._matcher = package.LighterGlue(weights=folder / "xfeat-lighterglue.pt").net.to("cpu").eval()
 
     def features(
-        self, pixels: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
+        self, pixels: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None, *, turned: bool = False
     ) -> LearnedFeatures:
-        """The strongest features of a photo, or of what a mask shows, at the size of SIDE."""
+        """The strongest features of a photo, or of what a mask shows, at the size of SIDE; `turned`: with descriptors
+        of the turned photo too."""
         import torch
 
         height, width = pixels.shape[:2]
@@ -89,18 +113,47 @@ class LearnedMatcher:
         tensor = torch.from_numpy(np.asarray(image, dtype=np.float32) / 255).permute(2, 0, 1)[None]
         most = MAX_KEYPOINTS if mask is None else CANDIDATES * MAX_KEYPOINTS
         found = self._extractor.detectAndCompute(tensor, most)[0]
+        views = self._turned(tensor, found["keypoints"]) if turned else []
         # Pixel centers are at whole numbers there and at +0.5 here.
-        keypoints = (found["keypoints"].double().numpy() + 0.5) * (extents / small) + (left, top)
-        keypoints = np.minimum(keypoints, np.array([width, height]) - 1e-3)
+        keypoints = (found["keypoints"].double().numpy() - OFFSET + 0.5) * (extents / small) + (left, top)
+        keypoints = keypoints.clip(0, np.array([width, height]) - 1e-3)
         descriptors = found["descriptors"].numpy()
         if mask is not None:
             columns, rows = keypoints.astype(int).T
             shown = np.flatnonzero(mask[rows, columns])[:MAX_KEYPOINTS]
-            keypoints, descriptors = keypoints[shown], descriptors[shown]
-        return LearnedFeatures(keypoints, descriptors, (width, height))
+            keypoints, descriptors, views = keypoints[shown], descriptors[shown], [rows[shown] for rows in views]
+        return LearnedFeatures(keypoints, descriptors, (width, height), tuple(views))
+
+    def _turned(self, image: Any, keypoints: Any) -> list[Float32[np.ndarray, "F 64"]]:
+        """Descriptors at keypoints of an image in the image turned by each quarter. The networks know no turns: seen
+        from another side, what is printed on a table lies otherwise in the picture."""
+        import torch
+
+        described, offset = [], torch.tensor(OFFSET)
+        places = keypoints - offset
+        with torch.inference_mode():
+            for _ in range(3):
+                places = torch.stack([places[:, 1], image.shape[3] - 1 - places[:, 0]], 1)
+                image = torch.rot90(image, 1, (2, 3))
+                fitted, down, across = self._extractor.preprocess_tensor(image)
+                planes = torch.nn.functional.normalize(self._extractor.net(fitted)[0], dim=1)
+                fine = (places + offset) / torch.tensor([across, down])
+                found = self._extractor.interpolator(planes, fine[None], H=fitted.shape[2], W=fitted.shape[3])[0]
+                described.append(torch.nn.functional.normalize(found, dim=1).numpy())
+        return described
 
     def match(self, first: LearnedFeatures, second: LearnedFeatures) -> UInt32[np.ndarray, "M 2"]:
-        """Rows of the features that match, each at most once."""
+        """Rows of the features that match, each at most once: as the photos are, and with the second one turned, where
+        that finds some; the turn with most matches goes first."""
+        upright, *turned = second.turns()
+        found = [self._matched(first, upright)]
+        for view in turned:
+            some = self._matched(first.strongest(TURN_STRONGEST), view.strongest(TURN_STRONGEST))
+            if len(some) >= LEAST_TURNED:
+                found.append(self._matched(first, view))
+        return _joined(sorted(found, key=len, reverse=True))
+
+    def _matched(self, first: LearnedFeatures, second: LearnedFeatures) -> UInt32[np.ndarray, "M 2"]:
         import torch
 
         if not len(first.keypoints) or not len(second.keypoints):
@@ -111,13 +164,26 @@ class LearnedMatcher:
 
 
 def lookalikes(first: LearnedFeatures, second: LearnedFeatures) -> int:
-    """Number of features that are each other's best match and alike: a cheap measure of what two photos share."""
-    if not len(first.descriptors) or not len(second.descriptors):
+    """Number of features that are each other's best match and alike, in the best turn: a cheap measure of what two
+    photos share."""
+    return max(_alike(first.descriptors, view.descriptors) for view in second.turns())
+
+
+def _alike(first: Float32[np.ndarray, "F 64"], second: Float32[np.ndarray, "G 64"]) -> int:
+    if not len(first) or not len(second):
         return 0
-    likeness = first.descriptors[:STRONGEST] @ second.descriptors[:STRONGEST].T
+    likeness = first[:STRONGEST] @ second[:STRONGEST].T
     best = likeness.argmax(axis=1)
     rows = np.arange(len(best))
     return int(((likeness.argmax(axis=0)[best] == rows) & (likeness[rows, best] > MIN_LIKENESS)).sum())
+
+
+def _joined(matches: list[UInt32[np.ndarray, "M 2"]]) -> UInt32[np.ndarray, "M 2"]:
+    """All rows whose features no row before them has."""
+    rows = np.concatenate(matches)
+    for column in (0, 1):
+        rows = rows[np.sort(np.unique(rows[:, column], return_index=True)[1])]
+    return rows
 
 
 def _box(mask: Bool[np.ndarray, "H W"]) -> tuple[int, int, int, int]:

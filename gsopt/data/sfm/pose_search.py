@@ -160,7 +160,7 @@ class PoseSearch:
             if matcher is None:
                 return features.match(project, names, self.matching, self.report)
             folders, threads = (self.inputs.photos, self.inputs.masks), self.config.threads
-            self.learned = learned_matches(matcher, *folders, names, threads, self.report)
+            self.learned = learned_matches(matcher, *folders, names, threads, self.report, turned=self._is_few())
             return match_joined(project, self.learned, self.inputs.masks)
 
     def _chosen_features(self) -> Features:

@@ -89,6 +89,16 @@ def test_photos_that_look_up_to_sixty_degrees_apart_are_matched_with_their_true_
         np.testing.assert_allclose(geometry.E, pycolmap.essential_matrix_from_pose(relative))
 
 
+@pytest.mark.parametrize(("count", "kept"), [(18, 18), (17, 0)])
+def test_photos_of_other_sides_keep_the_matches_that_they_had(count: int, kept: int) -> None:
+    """A partner is not looked for there."""
+    made = cameras(0, 90)
+    earlier = {(1, 2): np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)}
+    looks = dict.fromkeys((1, 2), np.eye(128, dtype=np.float32)[:COUNT])
+    found = written(made, seen(made, earlier), looks)[1:]
+    assert [len(geometry.inlier_matches) for _, _, geometry in found] == [kept] * (kept > 0)
+
+
 def test_every_pair_of_placed_photos_is_matched_once() -> None:
     made = cameras(0, 20, 40)
     looks = dict.fromkeys((1, 2, 3), np.eye(128, dtype=np.float32)[:COUNT])

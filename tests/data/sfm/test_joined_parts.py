@@ -11,13 +11,14 @@ import pytest
 from PIL import Image
 
 from gsopt.data.sfm import joined_features
+from gsopt.data.sfm.learned_features import LearnedFeatures
 
 
 class Matcher:
     """It finds what it is given."""
 
-    def features(self, pixels: np.ndarray, mask: np.ndarray | None = None) -> Any:
-        return pixels.shape, None if mask is None else mask.tolist()
+    def features(self, pixels: np.ndarray, mask: np.ndarray | None = None, *, turned: bool = False) -> Any:
+        return pixels.shape, turned if mask is None else mask.tolist()
 
     def match(self, first: Any, second: Any) -> Any:
         return first, second
@@ -31,9 +32,22 @@ def test_a_mask_shows_from_the_middle_of_its_grays_on(tmp_path: Path) -> None:
     masks.mkdir()
     Image.fromarray(np.array([[0, 127, 128, 255]] * 2, np.uint8)).save(masks / "a.png.png")
     matcher: Any = Matcher()
-    assert joined_features._features(matcher, tmp_path, masks, "a.png") == ((2, 4, 3), [[False, False, True, True]] * 2)
-    assert joined_features._features(matcher, tmp_path, masks, "b.png") == ((2, 4, 3), None)
-    assert joined_features._features(matcher, tmp_path, None, "a.png") == ((2, 4, 3), None)
+    shown = [[False, False, True, True]] * 2
+    assert joined_features._features(matcher, tmp_path, masks, False, "a.png") == ((2, 4, 3), shown)
+    assert joined_features._features(matcher, tmp_path, masks, False, "b.png") == ((2, 4, 3), False)
+    for turned in (False, True):
+        assert joined_features._features(matcher, tmp_path, None, turned, "a.png") == ((2, 4, 3), turned)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_whole_photos_are_turned_and_cut_out_objects_are_not(turned: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    nothing = LearnedFeatures(np.zeros((0, 2)), np.zeros((0, 64), np.float32), (9, 9))
+    monkeypatch.setattr(joined_features, "_features", lambda *given: asked.append(given[2:]) or nothing)
+    matcher: Any = Matcher()
+    where = (Path("photos"), Path("masks"), ["a.png"], 1, lambda line: None)
+    joined_features.learned_matches(matcher, *where, turned=turned)
+    assert asked == [(None, turned, "a.png"), (Path("masks"), False, "a.png")]
 
 
 def test_features_are_matched_in_the_order_of_their_pair() -> None:

@@ -15,7 +15,7 @@ pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
 
 import pycolmap
 import textured_room as room
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from gsopt.cli import main
 from gsopt.data.sfm import pose_search
@@ -34,7 +34,7 @@ COUNT = 40
 class DotMatcher:
     """Features at known places, which match by their rows: no network."""
 
-    def features(self, pixels: Any, mask: Any = None) -> LearnedFeatures:
+    def features(self, pixels: Any, mask: Any = None, *, turned: bool = False) -> LearnedFeatures:
         height, width = pixels.shape[:2]
         drawn = np.random.default_rng(0)
         places = drawn.uniform(0.1, 0.9, (COUNT, 2)) * (width, height)
@@ -71,7 +71,7 @@ def search(work: Path, count: int, *, video: bool = False, **settings: Any) -> P
 
 
 def learned_of(made: ColmapProject, names: list[str], masks: Path | None = None, threads: int = 1) -> Any:
-    return learned_matches(DotMatcher(), made.photos, masks, names, threads, lambda line: None)
+    return learned_matches(DotMatcher(), made.photos, masks, names, threads, lambda line: None, turned=False)
 
 
 def test_joined_rows_are_those_of_sift_and_then_the_learned_ones(tmp_path: Path) -> None:
@@ -274,6 +274,35 @@ def test_the_real_networks_find_a_shift() -> None:
     assert right.sum() > 100
     assert right.mean() > 0.9
     assert np.array_equal(rows, matcher.match(first, second))
+
+
+def printed_page() -> np.ndarray:
+    """Colored rectangles, turned at random."""
+    drawn = np.random.default_rng(0)
+    page = Image.new("RGB", (430, 350), (200, 190, 180))
+    for _ in range(150):
+        angle, half = drawn.uniform(0, 2 * np.pi), drawn.uniform(5, 30, 2)
+        R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        corners = (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ R.T + drawn.uniform(0, 1, 2) * page.size
+        ImageDraw.Draw(page).polygon(list(map(tuple, corners)), fill=tuple(drawn.integers(0, 255, 3).tolist()))
+    return np.asarray(page)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_the_real_networks_find_a_photo_that_is_turned(quarters: int) -> None:
+    """Not square, and of a size that the extractor has to change. What it finds beside a corner would turn about it."""
+    matcher, page = real(), printed_page()
+    upright = matcher.features(page)
+    features = matcher.features(np.ascontiguousarray(np.rot90(page, quarters)), turned=True)
+    rows = matcher.match(upright, features)
+    back = list(features.turns())[4 - quarters]
+    assert back.size == upright.size
+    moved = back.keypoints[rows[:, 1]] - upright.keypoints[rows[:, 0]]
+    right = np.linalg.norm(moved, axis=1) < 2
+    assert right.sum() > 1000
+    assert right.mean() > 0.95
+    assert np.abs(np.median(moved[right], axis=0)).max() < 0.1
+    assert len(matcher.match(upright, replace(features, turned=()))) < 100
 
 
 def test_the_real_extractor_stays_inside_a_mask() -> None:

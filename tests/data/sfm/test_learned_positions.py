@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from gsopt.errors import InputError
 
 
 class WhitePixels:
-    """A network that finds the white pixels, at the centers that the real one gives: whole numbers."""
+    """A network that finds the white pixels, where the real one does: at whole numbers, and beside them."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[tuple[int, ...], int]] = []
@@ -23,7 +24,7 @@ class WhitePixels:
     def detectAndCompute(self, image: Any, most: int) -> list[dict[str, Any]]:
         self.asked.append((tuple(image.shape), most))
         rows, columns = torch.nonzero(image[0].mean(0) > 0.99, as_tuple=True)
-        places = torch.stack([columns, rows], dim=1).float()
+        places = torch.stack([columns, rows], dim=1).double() + torch.tensor(learned_features.OFFSET)
         return [{"keypoints": places, "descriptors": torch.ones(len(places), 64)}]
 
 
@@ -44,10 +45,24 @@ def test_a_feature_of_a_pixel_lies_at_its_center() -> None:
     side = learned_features.SIDE
     found, network = matcher()
     features = found.features(photo(side, side // 2, (0, 0), (7, 3), (side - 1, side // 2 - 1)))
-    assert features.keypoints.tolist() == [[0.5, 0.5], [7.5, 3.5], [side - 0.5, side // 2 - 0.5]]
+    expected = [[0.5, 0.5], [7.5, 3.5], [side - 0.5, side // 2 - 0.5]]
+    np.testing.assert_allclose(features.keypoints, expected, atol=1e-5)
     assert features.size == (side, side // 2)
     assert network.asked == [((1, 3, side // 2, side), learned_features.MAX_KEYPOINTS)]
     assert features.descriptors.shape == (3, 64)
+
+
+def test_features_stay_in_the_photo() -> None:
+    """A corner at the border may be found beside it."""
+    side = learned_features.SIDE
+    found, network = matcher()
+    network.detectAndCompute = lambda image, most: [  # type: ignore[method-assign]
+        {"keypoints": torch.tensor([[0.0, side], [side, -9.0]]), "descriptors": torch.ones(2, 64)}
+    ]
+    keypoints = found.features(photo(side, side)).keypoints
+    np.testing.assert_allclose(keypoints, [[0.05, side], [side - 0.0, 0]], atol=2e-3)
+    assert (keypoints >= 0).all()
+    assert (keypoints < side).all()
 
 
 def test_a_photo_is_looked_at_in_one_size_and_its_features_are_where_they_were() -> None:
@@ -121,6 +136,55 @@ def test_photos_without_features_match_nothing_and_others_as_the_network_says() 
     assert found.match(some, some).tolist() == [[0, 1], [2, 0]]
     assert asked[0]["image0"]["keypoints"].shape == (1, 3, 2)
     assert asked[0]["image1"]["image_size"].tolist() == [[9, 9]]
+
+
+def test_turned_features_are_where_their_photo_shows_them() -> None:
+    pixels = np.zeros((3, 5), int)
+    pixels[1, 4] = 1
+    found = LearnedFeatures(
+        np.array([[4.5, 1.5]]), np.eye(64)[:1], (5, 3), tuple(np.eye(64)[k : k + 1] for k in (1, 2, 3))
+    )
+    for quarters, view in enumerate(found.turns()):
+        shown = np.rot90(pixels, quarters)
+        (row,), (column,) = np.nonzero(shown)
+        assert view.keypoints.tolist() == [[column + 0.5, row + 0.5]]
+        assert view.size == (shown.shape[1], shown.shape[0])
+        assert int(view.descriptors[0].argmax()) == quarters
+        assert view.turned == ()
+    assert quarters == 3
+    two = LearnedFeatures(np.zeros((2, 2)), np.eye(64)[:2], (9, 9), (np.eye(64)[2:4],) * 3)
+    assert len(two.strongest(1).keypoints) == len(two.strongest(1).descriptors) == 1
+    assert [len(view.descriptors) for view in two.strongest(1).turns()] == [1] * 4
+
+
+def test_photos_look_alike_in_the_best_turn() -> None:
+    first, other = features(np.eye(64)[:3]), np.eye(64)[10:13].astype(np.float32)
+    turned = (other, np.eye(64)[[0, 1, 12]].astype(np.float32), other)
+    assert lookalikes(first, replace(features(other), turned=turned)) == 2
+    assert lookalikes(first, replace(features(np.eye(64)[:3]), turned=turned)) == 3
+
+
+@pytest.mark.parametrize("few", [16, 15])
+def test_a_turn_counts_where_the_strongest_features_find_enough(few: int) -> None:
+    """The second turn finds as much with the strongest 1024 of 2000 features, and then more than the photo as it is."""
+    made, asked = matcher()[0], list[tuple[int, int, int]]()
+    whole = features(np.repeat(np.eye(64), 40, axis=0)[:2000])
+    second = replace(whole, turned=tuple(np.full((2000, 64), k, np.float32) for k in (1, 2, 3)))
+
+    def matched(one: LearnedFeatures, other: LearnedFeatures) -> np.ndarray:
+        turn = int(other.descriptors[0, 5])
+        asked.append((turn, len(one.keypoints), len(other.keypoints)))
+        if len(other.keypoints) == 1024:
+            return np.zeros((few if turn == 2 else 15, 2), np.uint32)
+        return np.array([[0, 0], [1, 1], [2, 7]] if turn == 0 else [[3, 3], [4, 4], [5, 5], [2, 6], [0, 9]], np.uint32)
+
+    made._matched = matched  # type: ignore[method-assign]
+    found = made.match(whole, second).tolist()
+    as_it_is, turned = [[0, 0], [1, 1], [2, 7]], [[3, 3], [4, 4], [5, 5], [2, 6], [0, 9]]
+    assert found == ([*turned, [1, 1]] if few == 16 else as_it_is)
+    strongest = [(turn, 1024, 1024) for turn in (1, 2, 3)]
+    expected = [(0, 2000, 2000), *strongest]
+    assert asked == ([*expected[:3], (2, 2000, 2000), *expected[3:]] if few == 16 else expected)
 
 
 def test_weights_of_another_content_or_size_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

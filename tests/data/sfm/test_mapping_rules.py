@@ -11,7 +11,7 @@ import pytest
 from test_answers import CHAIN, NAMES, graph
 
 from gsopt.data.sfm import few_photos, mapping
-from gsopt.data.sfm.few_photos import Attempt, keep_confirmed, observations
+from gsopt.data.sfm.few_photos import Attempt, observations
 from gsopt.data.sfm.held_lens import focals_to_try
 from gsopt.data.sfm.mapping import covisible_groups, keep_coherent, mappers_to_try, off_center, seed_photos
 from gsopt.data.sfm.settings import SfmConfig
@@ -85,21 +85,6 @@ def test_the_largest_group_stays_and_of_equal_ones_the_first() -> None:
 
 def test_a_track_joins_every_photo_that_sees_it() -> None:
     assert covisible_groups(Reconstruction([1, 2, 3, 4], shared(15, 1, 2, 3, 4))) == [{1, 2, 3, 4}]
-
-
-@pytest.mark.parametrize(("count", "kept"), [(50, {1, 2, 3, 4}), (49, {1, 2, 3})])
-def test_a_photo_is_confirmed_by_fifty_points_of_three_photos(count: int, kept: set[int]) -> None:
-    model = Reconstruction([1, 2, 3, 4], [*shared(60, 1, 2, 3), *shared(count, 2, 3, 4), *shared(999, 1, 4)])
-    keep_confirmed(model)
-    assert model.photos == kept
-
-
-def test_photos_go_one_by_one_the_weakest_first() -> None:
-    """Without photo 4 nothing is left that three photos see."""
-    model = Reconstruction([1, 2, 3, 4], [*shared(30, 1, 2, 4), *shared(29, 2, 3, 4)])
-    keep_confirmed(model)
-    assert model.photos == set()
-    keep_confirmed(model)
 
 
 def test_the_median_photo_speaks_for_a_reconstruction() -> None:

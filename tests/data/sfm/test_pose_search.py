@@ -38,7 +38,10 @@ def test_features_of_all_photos_are_found_inside_masks_and_matched_by_their_kind
     run = search(tmp_path, lines, features=kind)
     names = [f"{i}.png" for i in range(6)]
 
-    def learned(matcher: str, photos: Path, masks: Path, given: list[str], threads: int, report: Any) -> str:
+    def learned(
+        matcher: str, photos: Path, masks: Path, given: list[str], threads: int, report: Any, *, turned: bool
+    ) -> str:
+        assert turned
         assert (matcher, photos, masks) == ("networks", tmp_path / "photos", tmp_path / "masks")
         assert (given, threads) == (names, 3)
         return "learned"
