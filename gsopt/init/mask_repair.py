@@ -97,6 +97,10 @@ class RepairedAlphas:
         return torch.cat([self.unmasked.get(index)[..., :3], self.alphas[index][..., None]], dim=2)
 
 
+Repairs = dict[int, tuple[UInt8[Tensor, "H W"], RepairedMask | None]]
+"""New alphas by row, and what was found about each that is worth a word."""
+
+
 def load_with_agreeing_masks(config: DataConfig) -> tuple[Scene, list[RepairedMask]]:
     """The scene with wrong masks of input views repaired, and which those are; as `load_scene` reads it where all masks
     agree, or where nothing tells the wrong ones."""
@@ -112,7 +116,9 @@ def load_with_agreeing_masks(config: DataConfig) -> tuple[Scene, list[RepairedMa
     alphas = {scene.train[row].index: alpha for row, (alpha, _) in found.items()}
     store = RepairedAlphas(scene.train[0].store, unmasked[0].store, alphas)
     views = tuple(replace(view, store=store) for view in scene.train)
-    return replace(scene, train=views, has_alpha=True), [finding for _, finding in found.values()]
+    return replace(scene, train=views, has_alpha=True), [
+        finding for _, finding in found.values() if finding is not None
+    ]
 
 
 def agreement_of(scene: Scene) -> Agreement | None:
@@ -127,27 +133,28 @@ def agreement_of(scene: Scene) -> Agreement | None:
     return mask_agreement(photos, find_focus([photo.camera for photo in photos], scene.extent))
 
 
-def _freed(views: tuple[View, ...], agreement: Agreement) -> dict[int, tuple[UInt8[Tensor, "H W"], RepairedMask]]:
+def _freed(views: tuple[View, ...], agreement: Agreement) -> Repairs:
     """Alphas of agreeing views without the parts that the hull of the others does not touch, which networks leave
-    beside an object: too small to disagree, but a photo's colors would hang in the air there. Returns them by row."""
-    found = {}
+    beside an object: too small to disagree, but a photo's colors would hang in the air there. Parts that are faint
+    everywhere need no word. Returns them by row."""
+    found: Repairs = {}
     for row in agreement.agreeing:
-        shown = agreement.photos[row].planes[3] > 0
+        planes = agreement.photos[row].planes
+        shown = planes[3] > 0
         stray = shown & ~touched(shown, agreement.projection(row))
         if not bool(stray.any()):
             continue
         alpha = views[row].pixels()[..., 3].clone()
         alpha[_enlarged(stray, *alpha.shape) > 0] = 0
-        found[row] = alpha, RepairedMask(views[row].name, "stray", agreement.covered[row], "freed")
+        finding = RepairedMask(views[row].name, "stray", agreement.covered[row], "freed")
+        found[row] = alpha, finding if int(planes[3][stray].max()) > 127 else None
     return found
 
 
-def _repaired(
-    views: tuple[View, ...], unmasked: tuple[View, ...], agreement: Agreement
-) -> dict[int, tuple[UInt8[Tensor, "H W"], RepairedMask]]:
+def _repaired(views: tuple[View, ...], unmasked: tuple[View, ...], agreement: Agreement) -> Repairs:
     """Alphas of the disagreeing views, and what was found about each, by row."""
     inside = _histogram(torch.cat([_object_colors(agreement.photos[row]) for row in agreement.agreeing]))
-    found = {}
+    found: Repairs = {}
     for row in agreement.disagreeing:
         kind = _kind(agreement, row) if views[row].pixels().shape[2] == 4 else "missing"
         hull, camera = agreement.projection(row), views[row].camera

@@ -7,7 +7,6 @@ few of them each decision of an incremental mapper counts.
 
 from __future__ import annotations
 
-import itertools
 import shutil
 from collections import Counter
 from collections.abc import Iterator
@@ -53,7 +52,7 @@ MIN_CONFIRMED = 50
 learned features were matched. 4 of 8 photos of the head with 10 to 29 were turned by up to 57 degrees, their mean error
 0.6 px."""
 MIN_SHARED = 30
-"""Points that two photos share, from which on their pair counts as one side of a triangle."""
+"""Points that two photos share and no third one sees, from which on their pair counts as one side of a triangle."""
 MIN_TURN = 6.0
 """Degrees by which an object on a turntable turns at least; what turns less is a reflection or the room."""
 AMPLE_OBSERVATIONS = 400
@@ -156,14 +155,13 @@ def keep_confirmed(reconstruction: Any) -> None:
     and so do three photos any two of which share points: their baselines form a triangle.
     """
     while True:
-        tracks = [
-            sorted({element.image_id for element in point.track.elements}) for point in reconstruction.points3D.values()
-        ]
-        shared = Counter(pair for photos in tracks for pair in itertools.combinations(photos, 2))
-        sides = sides_of_triangles({pair for pair, count in shared.items() if count >= MIN_SHARED})
+        points = reconstruction.points3D.values()
+        tracks = [tuple(sorted({element.image_id for element in point.track.elements})) for point in points]
+        alone = Counter(photos for photos in tracks if len(photos) == 2)
+        sides = sides_of_triangles({pair for pair, count in alone.items() if count >= MIN_SHARED})
         seen = Counter(dict.fromkeys(reconstruction.reg_image_ids(), 0))
         for photos in tracks:
-            if len(photos) > 2 or tuple(photos) in sides:
+            if len(photos) > 2 or photos in sides:
                 seen.update(photos)
         weakest = min(seen, key=lambda number: (seen[number], number), default=None)
         if weakest is None or seen[weakest] >= MIN_CONFIRMED:
@@ -171,7 +169,7 @@ def keep_confirmed(reconstruction: Any) -> None:
         reconstruction.deregister_frame(reconstruction.image(weakest).frame_id)
 
 
-def sides_of_triangles(pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+def sides_of_triangles(pairs: set[tuple[int, ...]]) -> set[tuple[int, ...]]:
     """The pairs (smaller number first) whose two photos each make another pair with the same third one."""
     partners: dict[int, set[int]] = {}
     for a, b in pairs:

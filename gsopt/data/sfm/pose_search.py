@@ -50,6 +50,9 @@ DISAGREEMENT = (
 )
 
 
+LEARNED_HELP = "Learned features place more of so few photos: pip install 'gsopt[match]', then try again."
+
+
 @dataclass(frozen=True)
 class FoundPoses:
     """The outcome of a search."""
@@ -111,7 +114,14 @@ class PoseSearch:
             return found
         if self._wants_learned(mapped):
             found = self._with_learned(found)
-        return self._of_few(project, found) if self._is_few() else found
+        return self._advised(self._of_few(project, found)) if self._is_few() else found
+
+    def _advised(self, found: FoundPoses) -> FoundPoses:
+        """With a note where learned features, which nobody has installed, could place more of few photos."""
+        placed = len(found.mapped.names) if found.mapped is not None else 0
+        if placed == len(self.photos) or self.config.features != "auto" or self.video or _learned_installed():
+            return found
+        return replace(found, notes=[*found.notes, LEARNED_HELP])
 
     def _of_few(self, project: ColmapProject, found: FoundPoses) -> FoundPoses:
         """Poses that the photos agree with. SIFT alone takes fewer sides of a thing for each other: its poses are kept
@@ -236,10 +246,10 @@ class PoseSearch:
         lens = None if hypotheses.turning is None else one_lens(project)  # below, guesses replace its focal length
         look = SecondLook(project, hypotheses, lens)
         again, graph = few_photos.find_few_poses(project, hypotheses.matches, self.report)
-        if CONTRADICTED <= misses < math.inf:
+        if CONTRADICTED <= misses < math.inf and again is not None:
             better = misses > self._outline_misses(again)
         else:
-            better = trust < few_photos.MIN_OBSERVATIONS or placed < (len(again.names) if again is not None else 0)
+            better = trust < few_photos.MIN_OBSERVATIONS or placed <= (len(again.names) if again is not None else 0)
         return (replace(found, graph=graph, mapped=again, notes=look.notes) if better else found), look
 
     def _turned(self, look: SecondLook, found: FoundPoses) -> FoundPoses:

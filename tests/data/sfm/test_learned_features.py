@@ -178,6 +178,33 @@ def test_few_photos_get_learned_features_too_where_they_are_installed(
 
 
 @pytest.mark.parametrize(
+    ("placed", "source", "settings", "installed", "advised"),
+    [
+        (4, "photos", {}, False, True),
+        (None, "photos", {}, False, True),
+        (5, "photos", {}, False, False),
+        (4, "photos", {}, True, False),
+        (4, "photos", {"features": "sift"}, False, False),
+        (4, "film.mp4", {}, False, False),
+    ],
+)
+def test_who_lacks_learned_features_is_told_where_few_photos_find_no_place(
+    placed: int | None,
+    source: str,
+    settings: dict[str, Any],
+    installed: bool,
+    advised: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pose_search, "find_spec", lambda name: object() if installed else None)
+    run = search(tmp_path, 5, video=source.endswith(".mp4"), **settings)
+    mapped: Any = None if placed is None else SimpleNamespace(names=set(range(placed)))
+    found = FoundPoses(None, mapped, "sift", ["a note"])  # type: ignore[arg-type]
+    assert run._advised(found).notes == ["a note", *[pose_search.LEARNED_HELP] * advised]
+
+
+@pytest.mark.parametrize(
     ("count", "placed", "source", "settings", "installed", "want"),
     [
         (60, 53, "photos", {}, True, True),

@@ -132,12 +132,18 @@ def second_look(
 
 @pytest.mark.parametrize(
     ("trust", "again", "taken"),
-    [(100, None, False), (99, None, True), (100, 4, False), (100, 5, True), (149, 3, False), (149, 6, True)],
+    [(100, None, False), (99, None, True), (100, 3, False), (100, 4, True), (149, 3, False), (149, 6, True)],
 )
-def test_a_second_look_must_place_more_photos_than_a_first_one_that_can_be_trusted(
+def test_a_second_look_must_place_as_many_photos_as_a_first_one_that_can_be_trusted(
     trust: int, again: int | None, taken: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert second_look(tmp_path, monkeypatch, trust, (4, again)) == taken
+
+
+def test_poses_that_outlines_contradict_and_little_holds_do_not_stay(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert second_look(tmp_path, monkeypatch, 99, (4, None), (8.6, None))
 
 
 @pytest.mark.parametrize(
@@ -148,6 +154,7 @@ def test_a_second_look_must_place_more_photos_than_a_first_one_that_can_be_trust
         ((6, 5), (2.0, 2.0), False),
         ((6, 6), (8.6, 2.5), True),
         ((6, None), (8.6, None), False),
+        ((6, None), (1.0, None), False),
         ((4, 5), (8.6, 9.0), False),
         ((6, 5), (8.6, None), True),
         ((None, 3), (None, 9.0), True),
@@ -279,6 +286,7 @@ def test_poses_that_are_given_are_not_looked_for(posed: bool, tmp_path: Path, mo
         "_few": lambda project, found: (looked.append("few") or found, None),
         "_held": lambda project, found, mapped: looked.append("held") or found,
         "_agreement": lambda found: looked.append("agreement") or Agreement(0, 0),
+        "_advised": lambda found: found,
     }
     for name, stage in stages.items():
         monkeypatch.setattr(run, name, stage)
