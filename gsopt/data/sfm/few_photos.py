@@ -90,9 +90,9 @@ class Hypotheses:
 def match_few(project: ColmapProject, masks: Path | None, learned: LearnedMatches | None) -> Hypotheses:
     """Matches inside the masks, if there are any, and in the whole photos; without a background at rest.
 
-    With learned features, what three photos contradict is left out.
+    With learned features, also of turned photos, what three photos contradict is left out.
     """
-    pairs = match_features(project) if learned is None else joined_matches(project, learned)
+    pairs = match_features(project) if learned is None else joined_matches(project, learned, turned=True)
     seed, joint = project.config.seed, learned is not None
     moving = without_background(project.pycolmap, pairs, seed, jointly=joint)
     agreed = moving or pairs
@@ -137,6 +137,8 @@ def find_few_poses(
         found = with_guided_matches(project, pairs, found)
     if found.num_reg_images() < count:
         found = _grown(project, pairs, found)
+        if project.config.features != "sift":
+            keep_confirmed(found)
     keep_coherent(found)
     sound = found.num_reg_images() >= SMALLEST_MODEL and has_real_lens(project, found, report)
     return (MappingResult(found, "few photos", []) if sound else None), graph

@@ -9,7 +9,7 @@ import itertools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +20,7 @@ from PIL import Image
 from gsopt.data.image_files import IMAGE_FORMATS
 from gsopt.data.sfm.consistent_matches import consistent, on_epipolar_lines
 from gsopt.data.sfm.features import ColmapProject, Pair, ViewGraph, read_graph
-from gsopt.data.sfm.learned_features import LearnedFeatures, lookalikes
+from gsopt.data.sfm.learned_features import LearnedFeatures, lookalikes, turned_lookalikes
 from gsopt.data.sfm.pair_matches import Matches, PairMatches, Points, inside, match_features, read_matches
 from gsopt.events import Report
 
@@ -37,6 +37,8 @@ class Matcher(Protocol):
 
     def match(self, first: LearnedFeatures, second: LearnedFeatures) -> Matches: ...
 
+    def match_turned(self, first: LearnedFeatures, second: LearnedFeatures, upright: Matches) -> Matches: ...
+
 
 @dataclass(frozen=True)
 class LearnedMatches:
@@ -44,6 +46,8 @@ class LearnedMatches:
 
     keypoints: dict[str, Points]
     matches: dict[Pair, Matches]
+    turned: dict[Pair, Matches]
+    """Those with photos turned by quarters too: more, of which more are wrong."""
 
 
 def learned_matches(
@@ -64,24 +68,38 @@ def learned_matches(
     """
     keypoints = {name: np.zeros((0, 2)) for name in names}
     matches: dict[Pair, Matches] = {}
+    more: dict[Pair, Matches] = {}
     for kind in ("whole photos",) if masks is None else ("whole photos", "objects in the masks"):
         folder = masks if kind != "whole photos" else None
         turns = turned and folder is None
         found = _each(partial(_features, matcher, photos, folder, turns), names, threads)
         features = dict(zip(names, found, strict=True))
         pairs = alike(features)
-        rows = _each(partial(_matched, matcher, features), pairs, threads)
-        for pair, row in zip(pairs, rows, strict=True):
-            shifted = row + np.array([len(keypoints[name]) for name in pair], np.uint32)
-            matches[pair] = np.concatenate([matches.get(pair, row[:0]), shifted]).astype(np.uint32)
+        rows = dict(zip(pairs, _each(partial(_matched, matcher, features), pairs, threads), strict=True))
+        _append(matches, rows, keypoints)
+        if turns:
+            pairs = sorted({*pairs, *alike(features, turned_lookalikes)})
+            found = _each(partial(_matched_turned, matcher, features, rows), pairs, threads)
+            rows = dict(zip(pairs, found, strict=True))
+        _append(more, rows, keypoints)
         keypoints = {name: np.concatenate([keypoints[name], features[name].keypoints]) for name in names}
         report(f"compared learned features of {len(pairs):,} pairs of {kind}")
-    return LearnedMatches(keypoints, matches)
+    return LearnedMatches(keypoints, matches, more)
 
 
-def alike(features: dict[str, LearnedFeatures]) -> list[Pair]:
+def _append(matches: dict[Pair, Matches], rows: dict[Pair, Matches], keypoints: dict[str, Points]) -> None:
+    """Adds the matches of further keypoints, which come after those that photos have."""
+    for pair, found in rows.items():
+        shifted = found + np.array([len(keypoints[name]) for name in pair], np.uint32)
+        matches[pair] = np.concatenate([matches.get(pair, found[:0]), shifted]).astype(np.uint32)
+
+
+def alike(
+    features: dict[str, LearnedFeatures], measure: Callable[[LearnedFeatures, LearnedFeatures], int] | None = None
+) -> list[Pair]:
     """The pairs worth comparing: each photo with those that look most like it, in the order of the photos."""
-    counts = {(a, b): lookalikes(features[a], features[b]) for a, b in itertools.combinations(features, 2)}
+    measure = measure or lookalikes
+    counts = {(a, b): measure(features[a], features[b]) for a, b in itertools.combinations(features, 2)}
     chosen: set[Pair] = set()
     for name in features:
         own = sorted((pair for pair in counts if name in pair), key=lambda pair: (-counts[pair], pair))
@@ -107,11 +125,12 @@ def match_joined(project: ColmapProject, learned: LearnedMatches, masks: Path | 
     return read_graph(project)
 
 
-def joined_matches(project: ColmapProject, learned: LearnedMatches) -> PairMatches:
-    """The matches of SIFT, unless learned features replace it, and the learned ones; not verified."""
+def joined_matches(project: ColmapProject, learned: LearnedMatches, *, turned: bool = False) -> PairMatches:
+    """The matches of SIFT, unless learned features replace it, and the learned ones, those of turned photos too where
+    asked for; not verified."""
     if project.config.features == "both":
         match_features(project)
-    join(project, learned)
+    join(project, replace(learned, matches=learned.turned) if turned else learned)
     return read_matches(project)
 
 
@@ -157,6 +176,13 @@ def _features(matcher: Matcher, photos: Path, masks: Path | None, turned: bool, 
 
 def _matched(matcher: Matcher, features: dict[str, LearnedFeatures], pair: Pair) -> Matches:
     return matcher.match(features[pair[0]], features[pair[1]])
+
+
+def _matched_turned(
+    matcher: Matcher, features: dict[str, LearnedFeatures], upright: dict[Pair, Matches], pair: Pair
+) -> Matches:
+    rows = upright.get(pair, np.zeros((0, 2), np.uint32))
+    return matcher.match_turned(features[pair[0]], features[pair[1]], rows)
 
 
 def _each(work: Callable[[Any], Any], items: Sequence[Any], threads: int) -> list[Any]:

@@ -142,18 +142,21 @@ class LearnedMatcher:
                 described.append(torch.nn.functional.normalize(found, dim=1).numpy())
         return described
 
-    def match(self, first: LearnedFeatures, second: LearnedFeatures) -> UInt32[np.ndarray, "M 2"]:
-        """Rows of the features that match, each at most once: as the photos are, and with the second one turned, where
-        that finds some; the turn with most matches goes first."""
-        upright, *turned = second.turns()
-        found = [self._matched(first, upright)]
+    def match_turned(
+        self, first: LearnedFeatures, second: LearnedFeatures, upright: UInt32[np.ndarray, "M 2"]
+    ) -> UInt32[np.ndarray, "N 2"]:
+        """Rows of the features that match with the second photo turned, where that finds some, and of the photos as
+        they are, each at most once: the turn with most matches goes first."""
+        _, *turned = second.turns()
+        found = [upright]
         for view in turned:
-            some = self._matched(first.strongest(TURN_STRONGEST), view.strongest(TURN_STRONGEST))
+            some = self.match(first.strongest(TURN_STRONGEST), view.strongest(TURN_STRONGEST))
             if len(some) >= LEAST_TURNED:
-                found.append(self._matched(first, view))
+                found.append(self.match(first, view))
         return _joined(sorted(found, key=len, reverse=True))
 
-    def _matched(self, first: LearnedFeatures, second: LearnedFeatures) -> UInt32[np.ndarray, "M 2"]:
+    def match(self, first: LearnedFeatures, second: LearnedFeatures) -> UInt32[np.ndarray, "M 2"]:
+        """Rows of the features that match in the photos as they are, each at most once."""
         import torch
 
         if not len(first.keypoints) or not len(second.keypoints):
@@ -164,18 +167,18 @@ class LearnedMatcher:
 
 
 def lookalikes(first: LearnedFeatures, second: LearnedFeatures) -> int:
-    """Number of features that are each other's best match and alike, in the best turn: a cheap measure of what two
-    photos share."""
-    return max(_alike(first.descriptors, view.descriptors) for view in second.turns())
-
-
-def _alike(first: Float32[np.ndarray, "F 64"], second: Float32[np.ndarray, "G 64"]) -> int:
-    if not len(first) or not len(second):
+    """Number of features that are each other's best match and alike: a cheap measure of what two photos share."""
+    if not len(first.descriptors) or not len(second.descriptors):
         return 0
-    likeness = first[:STRONGEST] @ second[:STRONGEST].T
+    likeness = first.descriptors[:STRONGEST] @ second.descriptors[:STRONGEST].T
     best = likeness.argmax(axis=1)
     rows = np.arange(len(best))
     return int(((likeness.argmax(axis=0)[best] == rows) & (likeness[rows, best] > MIN_LIKENESS)).sum())
+
+
+def turned_lookalikes(first: LearnedFeatures, second: LearnedFeatures) -> int:
+    """The same in the best turn of the second photo."""
+    return max(lookalikes(first, view) for view in second.turns())
 
 
 def _joined(matches: list[UInt32[np.ndarray, "M 2"]]) -> UInt32[np.ndarray, "M 2"]:

@@ -118,7 +118,7 @@ def test_three_photos_whose_median_one_sees_a_hundred_points_are_trusted(
         (4, 400, "both", ["confirmed", "guided", "coherent"]),
         (4, 399, "both", ["confirmed", "guided", "coherent"]),
         (3, 400, "sift", ["grown", "coherent"]),
-        (3, 400, "xfeat", ["confirmed", "guided", "grown", "coherent"]),
+        (3, 400, "xfeat", ["confirmed", "guided", "grown", "confirmed", "coherent"]),
     ],
 )
 def test_matches_are_added_below_four_hundred_points_and_photos_where_some_are_missing(
@@ -150,7 +150,7 @@ def test_matches_inside_the_masks_come_first_and_learned_ones_must_be_consistent
         return f"moving{' jointly' if jointly else ''} {pairs}" if turntable else None
 
     monkeypatch.setattr(few_photos, "match_features", lambda project: "sift")
-    monkeypatch.setattr(few_photos, "joined_matches", lambda project, learned: learned)
+    monkeypatch.setattr(few_photos, "joined_matches", lambda project, learned, *, turned: learned if turned else "")
     monkeypatch.setattr(few_photos, "without_background", moving)
     monkeypatch.setattr(few_photos, "on_epipolar_lines", lambda pycolmap, pairs, seed: f"{pairs} on lines")
     monkeypatch.setattr(few_photos, "consistent", lambda pairs: f"{pairs}, consistent")

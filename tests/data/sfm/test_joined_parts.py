@@ -23,6 +23,9 @@ class Matcher:
     def match(self, first: Any, second: Any) -> Any:
         return first, second
 
+    def match_turned(self, first: Any, second: Any, upright: Any) -> Any:
+        return first, second, upright.tolist()
+
 
 def test_a_mask_shows_from_the_middle_of_its_grays_on(tmp_path: Path) -> None:
     """A photo without a mask counts everywhere."""
@@ -55,6 +58,28 @@ def test_features_are_matched_in_the_order_of_their_pair() -> None:
     found: Any = {"a": "of a", "b": "of b"}
     assert joined_features._matched(matcher, found, ("a", "b")) == ("of a", "of b")
     assert joined_features._matched(matcher, found, ("b", "a")) == ("of b", "of a")
+    upright = {("a", "b"): np.array([[1, 2]], np.uint32)}
+    assert joined_features._matched_turned(matcher, found, upright, ("a", "b")) == ("of a", "of b", [[1, 2]])
+    assert joined_features._matched_turned(matcher, found, upright, ("b", "a")) == ("of b", "of a", [])
+
+
+def test_matches_of_turned_photos_stand_beside_those_of_upright_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of whole photos, pairs that look alike only turned among them; matches inside the masks come after both."""
+    features = {name: LearnedFeatures(np.full((5, 2), at), np.zeros((5, 64), np.float32), (9, 9)) for at, name in
+                enumerate(("a", "b", "c"))}  # fmt: skip
+    monkeypatch.setattr(joined_features, "_features", lambda *given: features[given[-1]])
+    monkeypatch.setattr(joined_features, "lookalikes", lambda one, other: 20 * (other.keypoints[0, 0] == 1))
+    monkeypatch.setattr(joined_features, "turned_lookalikes", lambda one, other: 20 * (one.keypoints[0, 0] == 1))
+    monkeypatch.setattr(joined_features, "_matched", lambda *given: np.array([[0, 0]], np.uint32))
+    monkeypatch.setattr(joined_features, "_matched_turned", lambda *given: np.array([[3, 4]], np.uint32))
+    where = (Path("photos"), Path("masks"), ["a", "b", "c"], 1, lambda line: None)
+    found = joined_features.learned_matches(Matcher(), *where, turned=True)  # type: ignore[arg-type]
+    assert {pair: rows.tolist() for pair, rows in found.matches.items()} == {("a", "b"): [[0, 0], [5, 5]]}
+    turned = {pair: rows.tolist() for pair, rows in found.turned.items()}
+    assert turned == {("a", "b"): [[3, 4], [5, 5]], ("b", "c"): [[3, 4]]}
+    found = joined_features.learned_matches(Matcher(), *where, turned=False)  # type: ignore[arg-type]
+    assert {pair: rows.tolist() for pair, rows in found.turned.items()} == {("a", "b"): [[0, 0], [5, 5]]}
+    assert found.matches.keys() == found.turned.keys()
 
 
 @pytest.mark.parametrize("threads", [0, 1, 3])

@@ -92,6 +92,15 @@ def test_joined_rows_are_those_of_sift_and_then_the_learned_ones(tmp_path: Path)
     assert len(rows) > COUNT  # SIFT's own matches are there too
 
 
+def test_matches_of_turned_photos_are_joined_where_asked_for(tmp_path: Path) -> None:
+    made, names = project(tmp_path, "xfeat")
+    pair = (names[0], names[1])
+    learned = replace(learned_of(made, names), turned={pair: np.array([[3, 5]], np.uint32)})
+    assert len(joined_matches(made, learned).matches) == 3
+    (rows,) = joined_matches(project(tmp_path / "again", "xfeat")[0], learned, turned=True).matches.values()
+    assert rows.tolist() == [[3, 5]]
+
+
 def test_learned_features_alone_fill_a_database_without_sift(tmp_path: Path) -> None:
     made, names = project(tmp_path, "xfeat")
     graph = match_joined(made, learned_of(made, names), None)
@@ -321,7 +330,8 @@ def test_the_real_networks_find_a_photo_that_is_turned(quarters: int) -> None:
     matcher, page = real(), printed_page()
     upright = matcher.features(page)
     features = matcher.features(np.ascontiguousarray(np.rot90(page, quarters)), turned=True)
-    rows = matcher.match(upright, features)
+    few = matcher.match(upright, features)
+    rows = matcher.match_turned(upright, features, few)
     back = list(features.turns())[4 - quarters]
     assert back.size == upright.size
     moved = back.keypoints[rows[:, 1]] - upright.keypoints[rows[:, 0]]
@@ -329,7 +339,8 @@ def test_the_real_networks_find_a_photo_that_is_turned(quarters: int) -> None:
     assert right.sum() > 1000
     assert right.mean() > 0.95
     assert np.abs(np.median(moved[right], axis=0)).max() < 0.1
-    assert len(matcher.match(upright, replace(features, turned=()))) < 100
+    assert len(few) < 100
+    assert np.array_equal(matcher.match_turned(upright, replace(features, turned=()), few), few)
 
 
 def test_the_real_extractor_stays_inside_a_mask() -> None:

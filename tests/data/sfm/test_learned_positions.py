@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsopt.data.sfm import learned_features
-from gsopt.data.sfm.learned_features import LearnedFeatures, LearnedMatcher, lookalikes
+from gsopt.data.sfm.learned_features import LearnedFeatures, LearnedMatcher, lookalikes, turned_lookalikes
 from gsopt.errors import InputError
 
 
@@ -160,31 +160,32 @@ def test_turned_features_are_where_their_photo_shows_them() -> None:
 def test_photos_look_alike_in_the_best_turn() -> None:
     first, other = features(np.eye(64)[:3]), np.eye(64)[10:13].astype(np.float32)
     turned = (other, np.eye(64)[[0, 1, 12]].astype(np.float32), other)
-    assert lookalikes(first, replace(features(other), turned=turned)) == 2
-    assert lookalikes(first, replace(features(np.eye(64)[:3]), turned=turned)) == 3
+    assert turned_lookalikes(first, replace(features(other), turned=turned)) == 2
+    assert turned_lookalikes(first, replace(features(np.eye(64)[:3]), turned=turned)) == 3
+    assert turned_lookalikes(first, features(other)) == lookalikes(first, replace(features(other), turned=turned)) == 0
 
 
 @pytest.mark.parametrize("few", [16, 15])
 def test_a_turn_counts_where_the_strongest_features_find_enough(few: int) -> None:
-    """The second turn finds as much with the strongest 1024 of 2000 features, and then more than the photo as it is."""
+    """The second turn has more matches than the photo as it is, and goes first."""
     made, asked = matcher()[0], list[tuple[int, int, int]]()
     whole = features(np.repeat(np.eye(64), 40, axis=0)[:2000])
     second = replace(whole, turned=tuple(np.full((2000, 64), k, np.float32) for k in (1, 2, 3)))
+    turned = [[3, 3], [4, 4], [5, 5], [2, 6], [0, 9]]
 
-    def matched(one: LearnedFeatures, other: LearnedFeatures) -> np.ndarray:
+    def match(one: LearnedFeatures, other: LearnedFeatures) -> np.ndarray:
         turn = int(other.descriptors[0, 5])
         asked.append((turn, len(one.keypoints), len(other.keypoints)))
         if len(other.keypoints) == 1024:
             return np.zeros((few if turn == 2 else 15, 2), np.uint32)
-        return np.array([[0, 0], [1, 1], [2, 7]] if turn == 0 else [[3, 3], [4, 4], [5, 5], [2, 6], [0, 9]], np.uint32)
+        return np.array(turned, np.uint32)
 
-    made._matched = matched  # type: ignore[method-assign]
-    found = made.match(whole, second).tolist()
-    as_it_is, turned = [[0, 0], [1, 1], [2, 7]], [[3, 3], [4, 4], [5, 5], [2, 6], [0, 9]]
-    assert found == ([*turned, [1, 1]] if few == 16 else as_it_is)
+    made.match = match  # type: ignore[method-assign]
+    upright = np.array([[0, 0], [1, 1], [2, 7]], np.uint32)
+    found = made.match_turned(whole, second, upright).tolist()
+    assert found == ([*turned, [1, 1]] if few == 16 else upright.tolist())
     strongest = [(turn, 1024, 1024) for turn in (1, 2, 3)]
-    expected = [(0, 2000, 2000), *strongest]
-    assert asked == ([*expected[:3], (2, 2000, 2000), *expected[3:]] if few == 16 else expected)
+    assert asked == ([*strongest[:2], (2, 2000, 2000), strongest[2]] if few == 16 else strongest)
 
 
 def test_weights_of_another_content_or_size_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
