@@ -116,9 +116,8 @@ def load_with_agreeing_masks(config: DataConfig) -> tuple[Scene, list[RepairedMa
     alphas = {scene.train[row].index: alpha for row, (alpha, _) in found.items()}
     store = RepairedAlphas(scene.train[0].store, unmasked[0].store, alphas)
     views = tuple(replace(view, store=store) for view in scene.train)
-    return replace(scene, train=views, has_alpha=True), [
-        finding for _, finding in found.values() if finding is not None
-    ]
+    findings = [finding for _, finding in found.values() if finding is not None]
+    return replace(scene, train=views, has_alpha=True), findings
 
 
 def agreement_of(scene: Scene) -> Agreement | None:

@@ -41,7 +41,7 @@ def random_points(count: int) -> torch.Tensor:
 
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
-    """Of more points than one thread takes at once, the last of them alone."""
+    """The points are more than one thread takes at once, and the last of them stands alone."""
     image = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     points = random_points(2 * 2048 + 1)
     expected = lowest([Picture(CAMERA, image, unseen=-3.0)], points, beside=0.5, radius=0.1)

@@ -127,17 +127,17 @@ def find_few_poses(
     pairs = dict(hypotheses)[best.hypothesis]
     verify(project, pairs, best.reconstruction)
     graph = read_graph(project)
-    found = best.reconstruction
-    if project.config.features != "sift":
+    found, learned = best.reconstruction, project.config.features != "sift"
+    if learned:
         keep_confirmed(found)
     if observations(found) < MIN_OBSERVATIONS or found.num_reg_images() < SMALLEST_MODEL:
         report(f"{best.photos} photos share too few points to be trusted: {observations(found)} in the median photo")
         return None, graph
-    if observations(found) < AMPLE_OBSERVATIONS or project.config.features != "sift":
+    if observations(found) < AMPLE_OBSERVATIONS or learned:
         found = with_guided_matches(project, pairs, found)
     if found.num_reg_images() < count:
         found = _grown(project, pairs, found)
-        if project.config.features != "sift":
+        if learned:
             keep_confirmed(found)
     keep_coherent(found)
     sound = found.num_reg_images() >= SMALLEST_MODEL and has_real_lens(project, found, report)

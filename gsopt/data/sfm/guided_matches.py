@@ -25,6 +25,7 @@ this number on, as of what lies flat on a table."""
 RATIO = 0.85
 MAX_DISTANCE = 0.75
 """Farthest two descriptors may be apart, of unit length."""
+NOTHING: UInt32[np.ndarray, "0 2"] = np.zeros((0, 2), np.uint32)
 ROWS_AT_ONCE = 256
 """Features compared with all of the other photo at once, which then fit into the processor's cache."""
 
@@ -75,8 +76,7 @@ def _write_guided(project: ColmapProject, pairs: PairMatches, model: Any, descri
                 )
                 points = pairs.keypoints[a][: len(descriptors[a])], pairs.keypoints[b][: len(descriptors[b])]
                 limit = band * float(np.hypot(*pairs.sizes[a]))
-                looks = (descriptors[a], descriptors[b]) if near else (descriptors[a][:0], descriptors[b][:0])
-                rows = guided(fundamental, *points, *looks, limit)
+                rows = guided(fundamental, *points, descriptors[a], descriptors[b], limit) if near else NOTHING
                 rows = _with_verified(rows, pairs, (a, b), fundamental, limit)
                 if len(rows) < (1 if near else LEAST_FAR):
                     continue
@@ -121,7 +121,7 @@ def guided(
 ) -> UInt32[np.ndarray, "M 2"]:
     """Mutual best matches within `limit` px of the epipolar line that are clearly better than the next best there."""
     if not len(a) or not len(b):
-        return np.zeros((0, 2), np.uint32)
+        return NOTHING
     lines = (_homogeneous(first) @ fundamental.T).astype(np.float32)
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
     points = _homogeneous(second).T.astype(np.float32)

@@ -74,7 +74,7 @@ def learned_matches(
         turns = turned and folder is None
         found = _each(partial(_features, matcher, photos, folder, turns), names, threads)
         features = dict(zip(names, found, strict=True))
-        pairs = alike(features)
+        pairs = alike(features, lookalikes)
         rows = dict(zip(pairs, _each(partial(_matched, matcher, features), pairs, threads), strict=True))
         _append(matches, rows, keypoints)
         if turns:
@@ -95,10 +95,9 @@ def _append(matches: dict[Pair, Matches], rows: dict[Pair, Matches], keypoints: 
 
 
 def alike(
-    features: dict[str, LearnedFeatures], measure: Callable[[LearnedFeatures, LearnedFeatures], int] | None = None
+    features: dict[str, LearnedFeatures], measure: Callable[[LearnedFeatures, LearnedFeatures], int]
 ) -> list[Pair]:
     """The pairs worth comparing: each photo with those that look most like it, in the order of the photos."""
-    measure = measure or lookalikes
     counts = {(a, b): measure(features[a], features[b]) for a, b in itertools.combinations(features, 2)}
     chosen: set[Pair] = set()
     for name in features:

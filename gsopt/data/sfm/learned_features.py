@@ -33,8 +33,8 @@ STRONGEST = 1024
 CANDIDATES = 4
 """Features that are looked for, as a multiple of MAX_KEYPOINTS, where a mask leaves some out."""
 TURN_STRONGEST, LEAST_TURNED = 1024, 16
-"""Features by which quarter turns are judged, and matches among them from which on one counts. Two photos of a notebook
-on a table have at most 13 in a wrong turn."""
+"""Features by which quarter turns are judged, and matches among them from which on one counts. Pairs of four
+photos of a notebook on a table had 31 to 199 in their best turn; wrong ones had 0 to 20, and once 48."""
 MARGIN = 0.02
 """Border around what a mask shows, a share of the longer side."""
 STEP = 32

@@ -48,8 +48,6 @@ DISAGREEMENT = (
     "photos can match the wrong side. Take photos in between, each sharing two thirds of its picture with the next, "
     "and let a table or cloth with a pattern that never repeats be in the picture."
 )
-
-
 LEARNED_HELP = "Learned features place more of so few photos: pip install 'gsopt[match]', then try again."
 
 

@@ -64,7 +64,7 @@ def test_features_are_matched_in_the_order_of_their_pair() -> None:
 
 
 def test_matches_of_turned_photos_stand_beside_those_of_upright_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of whole photos, pairs that look alike only turned among them; matches inside the masks come after both."""
+    """Pairs of whole photos that look alike only turned are among them; matches inside the masks come after both."""
     features = {name: LearnedFeatures(np.full((5, 2), at), np.zeros((5, 64), np.float32), (9, 9)) for at, name in
                 enumerate(("a", "b", "c"))}  # fmt: skip
     monkeypatch.setattr(joined_features, "_features", lambda *given: features[given[-1]])

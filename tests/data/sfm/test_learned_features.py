@@ -151,7 +151,7 @@ def test_photos_are_compared_with_those_that_look_like_them() -> None:
         return LearnedFeatures(np.zeros((COUNT, 2)), unit.astype(np.float32), (10, 10))
 
     features = {f"{kind}{i}": looks(kind) for kind in (0, 1) for i in range(PARTNERS)}
-    pairs = alike(features)
+    pairs = alike(features, lookalikes)
     assert pairs
     assert all(a[0] == b[0] for a, b in pairs)
     nothing = LearnedFeatures(np.zeros((0, 2)), np.zeros((0, 64), np.float32), (10, 10))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -260,26 +261,21 @@ def test_the_fundamental_matrix_is_zero_for_two_images_of_a_point() -> None:
 
 
 @pytest.mark.parametrize(("alike", "compared"), [(20, True), (19, False)])
-def test_photos_with_twenty_lookalikes_are_compared(
-    monkeypatch: pytest.MonkeyPatch, alike: int, compared: bool
-) -> None:
-    monkeypatch.setattr(joined_features, "lookalikes", lambda a, b: alike)
+def test_photos_with_twenty_lookalikes_are_compared(alike: int, compared: bool) -> None:
     features: Any = {"a": 0, "b": 1}
-    assert joined_features.alike(features) == ([("a", "b")] if compared else [])
+    assert joined_features.alike(features, lambda a, b: alike) == ([("a", "b")] if compared else [])
 
 
 def test_each_photo_is_compared_with_the_six_most_like_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    def like_zero(a: int, b: int, most: int = 9) -> int:
+    def like_zero(a: Any, b: Any, most: int = 9) -> int:
         return 100 - abs(a - b) if 0 in (a, b) and max(a, b) < most else 0
 
-    monkeypatch.setattr(joined_features, "lookalikes", like_zero)
     features: Any = {f"{i}": i for i in range(9)}
-    assert joined_features.alike(features) == [("0", f"{i}") for i in range(1, 9)]  # each of them looks most like 0
-    monkeypatch.setattr(
-        joined_features, "lookalikes", lambda a, b: 100 - abs(a - b) if 0 in (a, b) and max(a, b) < 8 else 0
-    )
+    assert joined_features.alike(features, like_zero) == [
+        ("0", f"{i}") for i in range(1, 9)
+    ]  # each of them looks most like 0
     monkeypatch.setattr(joined_features, "MIN_LOOKALIKES", 94)
-    assert joined_features.alike(features) == [("0", f"{i}") for i in range(1, 7)]
+    assert joined_features.alike(features, partial(like_zero, most=8)) == [("0", f"{i}") for i in range(1, 7)]
 
 
 @pytest.mark.parametrize(("columns", "rest"), [(6, [1, 0, 0, 1]), (4, [1, 0]), (2, [])])
