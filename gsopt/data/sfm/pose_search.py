@@ -231,11 +231,12 @@ class PoseSearch:
     def _few(self, project: ColmapProject, found: FoundPoses) -> tuple[FoundPoses, SecondLook | None]:
         """Look a second time, with thorough features, where what was found cannot be trusted; returns the better, and
         what was seen."""
+        found = _confirmed(found)
         mapped = found.mapped
         trust = few_photos.trust(project, mapped)
         placed = len(mapped.names) if mapped is not None else 0
         misses = self._outline_misses(mapped)
-        if placed == len(self.photos) and trust >= few_photos.STRONG_OBSERVATIONS and misses < CONTRADICTED:
+        if placed == len(self.photos) and _is_strong(mapped, trust) and misses < CONTRADICTED:
             return found, None
         self.report(f"few photos with little in common: looking thoroughly for features (masks: {self.inputs.kind})")
         project = replace(project, database=project.database.with_name("thorough.db"))
@@ -284,6 +285,22 @@ class PoseSearch:
             return mapping.find_poses(project, graph, self.report)
         found = known_poses.triangulate(project, frames)
         return MappingResult(found, "poses as given", [])
+
+
+def _confirmed(found: FoundPoses) -> FoundPoses:
+    """The poses of few photos without those that no third photo confirms, where learned features were matched."""
+    if found.mapped is None or found.features == "sift":
+        return found
+    few_photos.keep_confirmed(found.mapped.reconstruction)
+    return found if len(found.mapped.names) >= mapping.SMALLEST_MODEL else replace(found, mapped=None)
+
+
+def _is_strong(mapped: MappingResult | None, trust: int) -> bool:
+    """True where no photo's pose needs a second look: the median one sees points enough, and others confirm enough of
+    those that the weakest one sees."""
+    if mapped is None or trust < few_photos.STRONG_OBSERVATIONS:
+        return False
+    return min(few_photos.confirmed_points(mapped.reconstruction).values()) >= few_photos.STRONG_OBSERVATIONS
 
 
 def _holds_others(one: MappingResult, other: MappingResult) -> bool:

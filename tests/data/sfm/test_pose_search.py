@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_answers import CHAIN, graph
+from test_mapping_rules import Reconstruction, shared
 
 from gsopt.data.sfm import features, few_photos, known_poses, mapping, pose_search
 from gsopt.data.sfm.mapping import MappingResult
@@ -185,16 +187,30 @@ def test_more_photos_about_one_axis_or_with_the_same_poses_hold(
 
 
 @pytest.mark.parametrize(
-    ("placed", "trust", "misses", "enough"),
-    [(6, 150, 1.99, True), (6, 149, 0.0, False), (5, 999, 0.0, False), (6, 999, 2.0, False), (6, 999, None, True)],
+    ("placed", "trust", "weakest", "misses", "enough"),
+    [
+        (6, 150, 150, 1.99, True),
+        (6, 149, 150, 0.0, False),
+        (6, 999, 149, 0.0, False),
+        (5, 999, 999, 0.0, False),
+        (6, 999, 999, 2.0, False),
+        (6, 999, 999, None, True),
+    ],
 )
-def test_one_look_is_enough_where_150_points_place_all_photos_and_no_outline_contradicts_them(
-    placed: int, trust: int, misses: float | None, enough: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_one_look_is_enough_where_150_points_place_each_photo_and_no_outline_contradicts_them(
+    placed: int,
+    trust: int,
+    weakest: int,
+    misses: float | None,
+    enough: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks: list[None] = []
     run = search(tmp_path, [])
     monkeypatch.setattr(features, "extract", lambda project, *_, **__: looks.append(project.database.touch()))
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
+    monkeypatch.setattr(few_photos, "confirmed_points", lambda _: Counter({1: 999, 2: weakest}))
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=False, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (None, graph({})))
     monkeypatch.setattr(pose_search, "outline_misses", lambda *_: misses)
@@ -232,3 +248,11 @@ def test_features_of_many_photos_are_kept_once(tmp_path: Path, monkeypatch: pyte
     run = search(tmp_path, [])
     run._extract(run._project(tmp_path, "sift"))
     assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
+
+
+@pytest.mark.parametrize(("kind", "count", "kept"), [("both", 50, 3), ("both", 49, 0), ("sift", 49, 3)])
+def test_first_poses_by_learned_features_are_confirmed_too(kind: str, count: int, kept: int) -> None:
+    model = Reconstruction([1, 2, 3], shared(count, 1, 2, 3))
+    found = FoundPoses(graph(CHAIN), MappingResult(model, "incremental", []), kind)  # type: ignore[arg-type]
+    mapped = pose_search._confirmed(found).mapped
+    assert len([] if mapped is None else mapped.names) == kept

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -119,6 +120,8 @@ def second_look(
     monkeypatch.setattr(pose_search.features, "extract", lambda project, *_, **__: project.database.touch())
     monkeypatch.setattr(pose_search, "outline_misses", lambda reconstruction, *_: misses[reconstruction])
     monkeypatch.setattr(few_photos, "trust", lambda *_: trust)
+    monkeypatch.setattr(few_photos, "keep_confirmed", lambda _: None)
+    monkeypatch.setattr(few_photos, "confirmed_points", lambda _: Counter({1: 150}))
     monkeypatch.setattr(few_photos, "match_few", lambda *_: SimpleNamespace(matches=[], turntable=True, turning=None))
     monkeypatch.setattr(few_photos, "find_few_poses", lambda *_: (looks[1], "another graph"))
     run = search(tmp_path, 6)
