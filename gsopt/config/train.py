@@ -83,7 +83,7 @@ class InitConfig:
     or random in the frustum. auto: stereo for few photos without alpha, unless as many SfM points are known; else SfM
     points when there are enough, else the hull when there is alpha, else random."""
     count: Annotated[int, Within(1, MAX_GAUSSIANS)] = 20_000
-    """Number of first Gaussians; stereo adds as many at random."""
+    """Number of first Gaussians; stereo adds as many in the background."""
 
     def __post_init__(self) -> None:
         check.fields(self, "init")

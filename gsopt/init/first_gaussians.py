@@ -14,7 +14,7 @@ from gsopt.data.scene import Scene
 from gsopt.errors import UsageError
 from gsopt.gaussians import Gaussians
 from gsopt.geometry.focus import find_focus
-from gsopt.init.frustum import random_points
+from gsopt.init.frustum import background_points, random_points
 from gsopt.init.hull import hull_points
 from gsopt.init.points import gaussians_at
 from gsopt.init.thumbnails import mean_colors, small_photos
@@ -99,11 +99,13 @@ def _from_stereo(scene: Scene, count: int, sh_degree: int, generator: torch.Gene
     found = stereo_points(scene, count, generator)
     if found.share < ENOUGH_AGREED:
         return None
-    # Something must start where only one photo looks, or none agree.
-    xyz, rgb = _random_points(scene, count, generator)
+    # Something must start where only one photo looks: far away, since nearer to others it would hang before them.
+    cameras = [view.camera for view in scene.train]
+    xyz = background_points(cameras, find_focus(cameras, scene.extent), count, generator)
+    rgb = mean_colors(small_photos(scene.train, _MAX_COLOR_PHOTOS), xyz)
     gaussians = gaussians_at(torch.cat([found.xyz, xyz]), torch.cat([found.rgb, rgb]), sh_degree)
     agreed = f"{found.photos} photos agree on {found.share:.0%} of their pixels"
-    return gaussians, f"{len(found.xyz):,} points by stereo ({agreed}) and {len(xyz):,} at random"
+    return gaussians, f"{len(found.xyz):,} points by stereo ({agreed}) and {len(xyz):,} in the background"
 
 
 def _random_points(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt.geometry.cameras import Cameras
@@ -14,6 +16,8 @@ BACKGROUND_SHARE = 0.3
 """Share of the points beyond the common region, where the scene has a background (no alpha)."""
 BACKGROUND_FAR = 8.0
 """Depth of the farthest background point, in distances to the focus."""
+CLEAR_OF_CAMERAS = 0.75
+"""Distance of background points to all cameras, in distances to the focus."""
 _MAX_ROUNDS = 32
 
 
@@ -22,33 +26,60 @@ def random_points(
 ) -> Float[Tensor, "N 3"]:
     """`count` points: uniform in the ball the cameras frame, where at least half of them see it.
 
-    With `background`, BACKGROUND_SHARE of them lie along random pixels behind the focus, uniform in inverse depth.
-    If the axes do not converge, all of them lie along random pixels, from a fifth of the focus distance on.
+    With `background`, BACKGROUND_SHARE of them lie behind it. If the axes do not converge, all of them lie along random
+    pixels.
     """
     if not focus.converging:
-        return _along_pixels(cameras, count, 0.2 * focus.distance, BACKGROUND_FAR * focus.distance, generator)
+        return background_points(cameras, focus, count, generator)
     behind = round(BACKGROUND_SHARE * count) if background else 0
     common = _in_common_region(cameras, focus, count - behind, generator)
-    far = _along_pixels(cameras, behind, focus.distance, BACKGROUND_FAR * focus.distance, generator)
-    return torch.cat([common, far])
+    return torch.cat([common, background_points(cameras, focus, behind, generator)])
+
+
+def background_points(
+    cameras: list[Cameras], focus: Focus, count: int, generator: torch.Generator
+) -> Float[Tensor, "N 3"]:
+    """`count` points along random pixels, uniform in inverse depth: behind the focus and clear of all cameras, since
+    whoever walks around a thing walks where others see the background. If the axes do not converge, from a fifth of the
+    focus distance on."""
+    near, far = (1.0 if focus.converging else 0.2) * focus.distance, BACKGROUND_FAR * focus.distance
+    if not focus.converging:
+        return _along_pixels(cameras, count, near, far, generator)
+    centers, reach = torch.cat([camera.centers for camera in cameras]), CLEAR_OF_CAMERAS * focus.distance
+    return _accepted(
+        lambda wanted: _along_pixels(cameras, wanted, near, far, generator),
+        lambda points: torch.cdist(points, centers).amin(1) >= reach,
+        count,
+    )
 
 
 def _in_common_region(
     cameras: list[Cameras], focus: Focus, count: int, generator: torch.Generator
 ) -> Float[Tensor, "N 3"]:
     """Uniform in the ball around the focus, rejecting what fewer than half of the cameras see."""
-    accepted: list[Tensor] = []
-    for _ in range(_MAX_ROUNDS):
-        points = focus.point + focus.radius * _in_unit_ball(count, generator)
-        seen = torch.zeros(count, dtype=torch.int32)
+
+    def is_common(points: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+        seen = torch.zeros(len(points), dtype=torch.int32)
         for camera in cameras:
             seen += sees(camera, points)
-        accepted.append(points[2 * seen >= len(cameras)])
-        if sum(map(len, accepted)) >= count:
-            return torch.cat(accepted)[:count]
-    # Cameras that hardly overlap: keep what there is and fill up from the ball.
-    missing = count - sum(map(len, accepted))
-    return torch.cat([*accepted, focus.point + focus.radius * _in_unit_ball(missing, generator)])
+        return 2 * seen >= len(cameras)
+
+    return _accepted(lambda wanted: focus.point + focus.radius * _in_unit_ball(wanted, generator), is_common, count)
+
+
+def _accepted(
+    draw: Callable[[int], Float[Tensor, "N 3"]],
+    is_fit: Callable[[Float[Tensor, "N 3"]], Bool[Tensor, "N"]],
+    count: int,
+) -> Float[Tensor, "N 3"]:
+    """`count` of the points drawn that fit; where hardly any does, as with cameras that hardly overlap, others too."""
+    accepted = torch.empty(0, 3)
+    for _ in range(_MAX_ROUNDS):
+        points = draw(count)
+        accepted = torch.cat([accepted, points[is_fit(points)]])[:count]
+        if len(accepted) == count:
+            return accepted
+    return torch.cat([accepted, draw(count - len(accepted))])
 
 
 def _in_unit_ball(count: int, generator: torch.Generator) -> Float[Tensor, "N 3"]:

@@ -18,7 +18,8 @@ from gsopt.errors import UsageError
 from gsopt.geometry.cameras import Cameras, intrinsics, look_at
 from gsopt.geometry.focus import Focus
 from gsopt.geometry.projection import inside, project
-from gsopt.init.frustum import random_points
+from gsopt.init import frustum
+from gsopt.init.frustum import CLEAR_OF_CAMERAS, background_points, random_points
 
 first = importlib.import_module("gsopt.init.first_gaussians")  # the package has its function under this name
 WIDTH, HEIGHT = 40, 20
@@ -106,6 +107,30 @@ def test_a_ball_that_nobody_sees_is_filled_all_the_same() -> None:
     assert is_even(((points - focus.point).norm(dim=1) / 2) ** 3, 0.15)
 
 
+def test_the_background_begins_behind_the_thing_and_leaves_the_way_around_it_free() -> None:
+    """Cameras all around look at the origin: what lies between two of them would hang before their neighbors."""
+    angles = torch.arange(8) * math.pi / 4
+    ring = [camera((3 * math.cos(angle), 3 * math.sin(angle), 0.0)) for angle in angles.tolist()]
+    focus = Focus(torch.zeros(3), 3.0, 1.0, converging=True)
+    points = background_points(ring, focus, 500, torch.Generator().manual_seed(0))
+    assert points.shape == (500, 3)
+    away = torch.cdist(points, torch.cat([each.centers for each in ring]))
+    assert float(away.min()) >= CLEAR_OF_CAMERAS * 3
+    depths = torch.stack([project(each, points)[2] for each in ring])
+    assert bool((depths.amax(0) >= 3 * (1 - 1e-5)).all())
+    assert bool((points.norm(dim=1) > 4).any())
+    again = background_points(ring, focus, 500, torch.Generator().manual_seed(0))
+    assert torch.equal(points, again)
+
+
+def test_a_background_without_a_place_clear_of_cameras_is_drawn_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frustum, "CLEAR_OF_CAMERAS", 100.0)
+    focus = Focus(torch.zeros(3), 3.0, 1.0, converging=True)
+    points = background_points([camera((3.0, 0, 0))], focus, 50, torch.Generator().manual_seed(0))
+    assert points.shape == (50, 3)
+    assert float(points[:, 0].max()) <= 1e-5
+
+
 def scene(views: int, alpha: bool, points: int = 0) -> Any:
     around = spread_cameras(views)
     train = tuple(SimpleNamespace(camera=around[i].to(torch.float32)) for i in range(views))
@@ -144,7 +169,7 @@ def test_an_asked_method_is_the_only_one(method: Any) -> None:
 def test_stereo_is_believed_from_a_twentieth_of_the_pixels_on(
     monkeypatch: pytest.MonkeyPatch, share: float, taken: bool
 ) -> None:
-    """What agrees stands beside as many random points; below that nothing is taken."""
+    """Points in the background stand beside what agrees; below that nothing is taken."""
     stereo = pytest.importorskip("gsopt.init.stereo.points")
     found = SimpleNamespace(xyz=torch.rand(30, 3) + 50, rgb=torch.ones(30, 3), photos=4, share=share)
     monkeypatch.setattr(stereo, "stereo_points", lambda *_: found)
@@ -156,7 +181,7 @@ def test_stereo_is_believed_from_a_twentieth_of_the_pixels_on(
         gaussians, said = start
         assert len(gaussians) == 100
         assert torch.equal(gaussians.means[:30], found.xyz)
-        assert said == "30 points by stereo (4 photos agree on 5% of their pixels) and 70 at random"
+        assert said == "30 points by stereo (4 photos agree on 5% of their pixels) and 70 in the background"
 
 
 def test_random_points_of_a_masked_thing_are_gray_and_stay_near_it() -> None:

@@ -43,8 +43,8 @@ MAX_ERROR = 3.0
 """Farthest from the epipolar line, px."""
 MAX_TRIALS = 5000
 STRONG_OBSERVATIONS = 150
-"""Points seen by the median photo with which the ordinary reconstruction of few photos is trusted, if others confirm so
-many of those that each photo sees: one of 12 with 45 was turned by 160 degrees, where the median one had 276."""
+"""Points seen by the median photo with which the ordinary reconstruction of few photos is trusted, if none of them is
+held by fewer than MIN_OBSERVATIONS confirmed ones: one of 12 with 45 was turned by 160 degrees, the median had 276."""
 MIN_OBSERVATIONS = 100
 """Points seen by the median photo below which poses are no better than a guess: 4 of 8 photos of a museum head with 86
 were turned by 3 to 70 degrees, 10 of 12 with 256 by 1.4."""

@@ -296,11 +296,11 @@ def _confirmed(found: FoundPoses) -> FoundPoses:
 
 
 def _is_strong(mapped: MappingResult | None, trust: int) -> bool:
-    """True where no photo's pose needs a second look: the median one sees points enough, and others confirm enough of
-    those that the weakest one sees."""
+    """True where no photo's pose needs a second look: the median one sees points enough, and the weakest one's is no
+    guess by those of its points that others confirm."""
     if mapped is None or trust < few_photos.STRONG_OBSERVATIONS:
         return False
-    return min(few_photos.confirmed_points(mapped.reconstruction).values()) >= few_photos.STRONG_OBSERVATIONS
+    return min(few_photos.confirmed_points(mapped.reconstruction).values()) >= few_photos.MIN_OBSERVATIONS
 
 
 def _holds_others(one: MappingResult, other: MappingResult) -> bool:

@@ -94,7 +94,7 @@ def test_auto_takes_stereo_where_there_are_no_masks_and_says_so(scene: Scene) ->
     gaussians, said = first_gaussians(scene, InitConfig(count=COUNT), 2, 0)
     assert "stereo" in said
     assert "\n" not in said
-    assert len(gaussians.validate()) == 2 * COUNT  # half of them at random
+    assert len(gaussians.validate()) == 2 * COUNT  # half of them in the background
     again, _ = first_gaussians(scene, InitConfig(count=COUNT), 2, 0)
     assert torch.equal(gaussians.means, again.means)
 
