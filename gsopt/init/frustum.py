@@ -1,4 +1,4 @@
-"""Random points in view of the cameras, for scenes that come with neither points nor silhouettes."""
+"""Random points in view of the cameras: beside those of stereo, or where a scene tells nothing of its shape."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def background_points(
     """`count` points along random pixels, uniform in inverse depth: behind the focus and clear of all cameras, since
     whoever walks around a thing walks where others see the background. If the axes do not converge, from a fifth of the
     focus distance on."""
-    near, far = (1.0 if focus.converging else 0.2) * focus.distance, BACKGROUND_FAR * focus.distance
+    far = BACKGROUND_FAR * focus.distance
     if not focus.converging:
-        return _along_pixels(cameras, count, near, far, generator)
+        return _along_pixels(cameras, count, 0.2 * focus.distance, far, generator)
     centers, reach = torch.cat([camera.centers for camera in cameras]), CLEAR_OF_CAMERAS * focus.distance
     return _accepted(
-        lambda wanted: _along_pixels(cameras, wanted, near, far, generator),
+        lambda wanted: _along_pixels(cameras, wanted, focus.distance, far, generator),
         lambda points: torch.cdist(points, centers).amin(1) >= reach,
         count,
     )
