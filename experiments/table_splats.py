@@ -1,4 +1,4 @@
-"""Whole scenes from eight photos without masks: things on a table in a room, seen from all around.
+"""Whole scenes from eight photos without masks: things on a table in a room, seen from all around or over 150 degrees.
 
     python experiments/table_photos.py MESHES SCENES --render            # needs bpy; 15 s a photo
     python experiments/table_splats.py SCENES OUT --arm NAME [--only vase2 ...] [--train="--seed 1"]
