@@ -80,8 +80,8 @@ class InitConfig:
 
     method: Literal["auto", "points", "hull", "stereo", "random"] = "auto"
     """Source of the first Gaussians: SfM points, the visual hull of the masks, places on which photos agree by stereo,
-    or random in the frustum. auto: stereo for few photos without alpha, unless as many SfM points are known; else SfM
-    points when there are enough, else the hull when there is alpha, else random."""
+    or random in the frustum. auto: stereo for photos without alpha, unless as many SfM points are known or, with more
+    than 16 photos, enough; else these; else the hull when there is alpha; else random."""
     count: Annotated[int, Within(1, MAX_GAUSSIANS)] = 20_000
     """Number of first Gaussians; stereo adds as many in the background."""
 

@@ -23,8 +23,8 @@ ENOUGH_POINTS = 100
 """Sparse points from which on they beat the hull and random points."""
 ENOUGH_AGREED = 0.05
 """Share of the pixels on which two photos must agree: photos of different rooms agree on 0.03 by chance."""
-FEW_PHOTOS = 10
-"""Photos up to which stereo finds depth better than random points do (docs/decisions/0003-stereo.md)."""
+FEW_PHOTOS = 16
+"""Photos up to which stereo beats sparse points: it matches no more, and they may show a part of the scene alone."""
 _MAX_COLOR_PHOTOS = 16
 Start = tuple[Gaussians, str]
 """The Gaussians, and a description of their origin."""
@@ -57,16 +57,16 @@ def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int)
 
 
 def _suited_methods(scene: Scene, known: int, config: InitConfig) -> list[str]:
-    """Methods before random points, best first: stereo for few unmasked photos, unless the scene has as many points;
-    else its points; the visual hull of a masked object."""
+    """Methods before random points, best first: stereo without masks, unless the scene has as many points or more
+    photos than stereo matches; else its points; the visual hull of a masked object."""
     if config.method != "auto":
         return [config.method] if config.method in METHODS else []
-    few = len(scene.train) <= FEW_PHOTOS
+    enough = config.count if len(scene.train) <= FEW_PHOTOS else ENOUGH_POINTS
     wanted = [
-        ("stereo", few and not scene.has_alpha and known < config.count),
+        ("stereo", not scene.has_alpha and known < enough),
         ("points", known >= ENOUGH_POINTS),
         ("hull", scene.has_alpha),
-        ("stereo", few and scene.has_alpha),  # alpha that hides nothing
+        ("stereo", scene.has_alpha),  # alpha that hides nothing
     ]
     return [method for method, worth in wanted if worth]
 

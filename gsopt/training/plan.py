@@ -18,7 +18,6 @@ from gsopt.config.train import (
 from gsopt.data.background import Background
 from gsopt.data.scene import Scene
 from gsopt.geometry.focus import find_focus
-from gsopt.init.first_gaussians import FEW_PHOTOS
 from gsopt.sds.guidance_plan import GuidancePlans
 from gsopt.sds.select_prior import PriorSelection, select_prior
 from gsopt.training.open_settings import OpenSettings, is_sparse, open_settings
@@ -39,6 +38,8 @@ OPAQUE_SHARE = 1 / 6
 NEAR_SHARE = 1.5
 # The same share, below which what is faint is haze (docs/decisions/0031-haze.md).
 HAZE_SHARE = 0.25
+# Photos up to which the depths on which they agree are a target; 12 know better by their colors (0003-stereo.md).
+MAX_MATCHED = 10
 # Most memory for float targets, as a share of the decoded images': both hold the same views.
 TARGET_CACHE_SHARE = 0.5
 
@@ -166,7 +167,7 @@ def guesses(config: TrainConfig, views: int) -> bool:
 
 def matches_photos(config: TrainConfig, scene: Scene) -> bool:
     """True when a run learns from the depths on which its photos agree: few photos of a whole scene."""
-    few = 1 < len(scene.train) <= FEW_PHOTOS and is_sparse(config.sparse, len(scene.train))
+    few = 1 < len(scene.train) <= MAX_MATCHED and is_sparse(config.sparse, len(scene.train))
     return few and not scene.has_alpha and config.loss.lambda_depth > 0 and config.data.depth is None
 
 

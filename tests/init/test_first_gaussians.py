@@ -58,10 +58,6 @@ def test_few_photos_that_agree_come_before_few_points(scene: Scene) -> None:
     for known, word in ((100, "by stereo"), (199, "by stereo"), (200, "points that came with the scene")):
         _, said = first_gaussians(with_points(opaque, known), InitConfig(count=200), 2, 0)
         assert word in said
-    many = dataclasses.replace(opaque, train=opaque.train * 2)
-    for known, word in ((100, "points that came with the scene"), (99, "random")):
-        _, said = first_gaussians(with_points(many, known), InitConfig(count=200), 2, 0)
-        assert word in said
 
 
 @pytest.mark.parametrize("method", ["points", "hull", "random"])

@@ -141,15 +141,16 @@ def scene(views: int, alpha: bool, points: int = 0) -> Any:
 @pytest.mark.parametrize(
     ("views", "alpha", "known", "methods"),
     [
-        (10, False, 0, ["stereo"]),
-        (11, False, 0, []),
-        (10, True, 0, ["hull", "stereo"]),
-        (11, True, 0, ["hull"]),
-        (10, False, 100, ["stereo", "points"]),
-        (10, True, 100, ["points", "hull", "stereo"]),
-        (11, False, 99, []),
-        (11, True, 100, ["points", "hull"]),
-        (10, False, 500, ["points"]),
+        (16, False, 0, ["stereo"]),
+        (17, False, 0, ["stereo"]),
+        (16, True, 0, ["hull", "stereo"]),
+        (17, True, 0, ["hull", "stereo"]),
+        (16, False, 100, ["stereo", "points"]),
+        (16, False, 499, ["stereo", "points"]),
+        (16, False, 500, ["points"]),
+        (17, False, 99, ["stereo"]),
+        (17, False, 100, ["points"]),
+        (16, True, 100, ["points", "hull", "stereo"]),
     ],
 )
 def test_methods_are_tried_in_the_order_of_what_the_scene_tells(

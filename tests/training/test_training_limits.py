@@ -72,7 +72,7 @@ def test_a_body_is_guessed_unless_something_speaks_against_it(
 
 def test_photos_are_matched_where_there_are_two_or_more_of_a_whole_scene() -> None:
     config = TrainConfig()
-    most = min(plan.FEW_PHOTOS, config.sparse.below_views)
+    most = min(plan.MAX_MATCHED, config.sparse.below_views)
     found = {views: plan.matches_photos(config, scene(views)) for views in (1, 2, most, most + 1)}
     assert found == {1: False, 2: True, most: True, most + 1: False}
     assert not plan.matches_photos(config, scene(2, has_alpha=True))
