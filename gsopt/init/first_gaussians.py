@@ -24,7 +24,7 @@ ENOUGH_POINTS = 100
 ENOUGH_AGREED = 0.05
 """Share of the pixels on which two photos must agree: photos of different rooms agree on 0.03 by chance."""
 FEW_PHOTOS = 16
-"""Photos up to which stereo beats sparse points: it matches no more, and they may show a part of the scene alone."""
+"""Photos up to which stereo beats sparse points: it matches no more of them (docs/decisions/0041)."""
 _MAX_COLOR_PHOTOS = 16
 Start = tuple[Gaussians, str]
 """The Gaussians, and a description of their origin."""
@@ -57,8 +57,8 @@ def first_gaussians(scene: Scene, config: InitConfig, sh_degree: int, seed: int)
 
 
 def _suited_methods(scene: Scene, known: int, config: InitConfig) -> list[str]:
-    """Methods before random points, best first: stereo without masks, unless the scene has as many points or more
-    photos than stereo matches; else its points; the visual hull of a masked object."""
+    """Methods before random points, best first: stereo without masks, unless the scene has points enough, with few
+    photos as many as are wanted; else its points; the visual hull of a masked object."""
     if config.method != "auto":
         return [config.method] if config.method in METHODS else []
     enough = config.count if len(scene.train) <= FEW_PHOTOS else ENOUGH_POINTS
