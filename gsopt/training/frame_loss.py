@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gsopt.geometry.precision import widest
@@ -21,6 +21,8 @@ LEAST_DEPTH_PIXELS = 16
 """Pixels below which a correlation of depths says nothing."""
 LEAST_VARIANCE = 1e-12
 """Variance of inverse depths, in squared means, below which a surface is flat as seen from the camera."""
+MAX_ERROR = 0.2
+"""Share of an inverse depth by which a render may miss it and still be drawn to it: photos agree on wrong ones too."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,9 @@ def frame_loss(
     if weights.alpha > 0 and target.alphas is not None:
         v_alphas = _sum(v_alphas, alpha_gradient(frame.alphas, target.alphas, weights.alpha * target.share))
     if target.inverse_depths is not None and frame.depths is not None:
-        through = depth_gradients(frame.depths, frame.alphas, target, weights.depth * target.share)
+        matched = weights.agreed > 0
+        of, depth_weight = (agreed_gradients, weights.agreed) if matched else (depth_gradients, weights.depth)
+        through = of(frame.depths, frame.alphas, target, depth_weight * target.share)
         v_depths, v_alphas = through[0], _sum(v_alphas, through[1])
     return FrameLoss(photometric.loss * weight, v_colors, v_alphas, v_depths)
 
@@ -68,20 +72,51 @@ def depth_gradients(
     w = alphas / depths with that of the target, over the pixels where both are known: no scale and no shift of the
     target changes it (Ranftl et al. 2020; as a correlation: Zhu et al. 2024, "FSGS"). With unit vectors w', y' of the
     n centered values, d(rho)/dw = (y' - rho w') / |w - mean w|."""
+    known, w, y = _inverse_depths(depths, alphas, target)
+    if len(w) < LEAST_DEPTH_PIXELS:
+        return torch.zeros_like(depths), torch.zeros_like(alphas)
+    w_unit, w_length = _centered_unit(w)
+    y_unit, y_length = _centered_unit(y)
+    if min(w_length, y_length) == 0:
+        return torch.zeros_like(depths), torch.zeros_like(alphas)
+    v_w = -weight * (y_unit - (y_unit @ w_unit) * w_unit) / w_length
+    return _through_inverse(v_w, w, known, depths, alphas)
+
+
+def agreed_gradients(
+    depths: Float[Tensor, "H W"], alphas: Float[Tensor, "H W"], target: Target, weight: float
+) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """d/d(depths, alphas) of weight · the mean over the image of |w / y - 1|, y an inverse depth on which photos agree,
+    in scene units; 0 where none is known, and where the render w misses it by more than MAX_ERROR."""
+    known, w, y = _inverse_depths(depths, alphas, target)
+    error = w / y - 1
+    v_w = weight / depths.numel() * error.sign() / y * (error.abs() < MAX_ERROR)
+    return _through_inverse(v_w, w, known, depths, alphas)
+
+
+def _inverse_depths(
+    depths: Float[Tensor, "H W"], alphas: Float[Tensor, "H W"], target: Target
+) -> tuple[Bool[Tensor, "H W"], Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """The pixels that have a depth in both, and the inverse depths there: the rendered w = alphas / depths, and the
+    target's."""
     assert target.inverse_depths is not None
     known = torch.isfinite(target.inverse_depths) & (alphas > SOLID) & (depths > 0)
     if target.alphas is not None:
         known &= target.alphas > SOLID
-    v_depths, v_alphas = torch.zeros_like(depths), torch.zeros_like(alphas)
     D, A, y = (values[known].to(widest(depths.device)) for values in (depths, alphas, target.inverse_depths))
-    if len(D) < LEAST_DEPTH_PIXELS:
-        return v_depths, v_alphas
-    w = A / D
-    w_unit, w_length = _centered_unit(w)
-    y_unit, y_length = _centered_unit(y)
-    if min(w_length, y_length) == 0:
-        return v_depths, v_alphas
-    v_w = -weight * (y_unit - (y_unit @ w_unit) * w_unit) / w_length
+    return known, A / D, y
+
+
+def _through_inverse(
+    v_w: Float[Tensor, "N"],
+    w: Float[Tensor, "N"],
+    known: Bool[Tensor, "H W"],
+    depths: Float[Tensor, "H W"],
+    alphas: Float[Tensor, "H W"],
+) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """d/d(depths, alphas) from d/dw, w = alphas / depths at the known pixels."""
+    v_depths, v_alphas = torch.zeros_like(depths), torch.zeros_like(alphas)
+    D = depths[known].to(w)
     v_depths[known] = (-v_w * w / D).to(depths)
     v_alphas[known] = (v_w / D).to(alphas)
     return v_depths, v_alphas

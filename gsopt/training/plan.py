@@ -38,8 +38,9 @@ OPAQUE_SHARE = 1 / 6
 NEAR_SHARE = 1.5
 # The same share, below which what is faint is haze (docs/decisions/0031-haze.md).
 HAZE_SHARE = 0.25
-# Photos up to which the depths on which they agree are a target; 12 know better by their colors (0003-stereo.md).
-MAX_MATCHED = 10
+# Photos up to which the depths on which they agree are a target, and the share of the run in which they are: true to
+# some percent, they put Gaussians where colors alone would not, and then colors know better (0042).
+MAX_MATCHED, MATCHED_SHARE = 10, 1 / 3
 # Most memory for float targets, as a share of the decoded images': both hold the same views.
 TARGET_CACHE_SHARE = 0.5
 
@@ -54,6 +55,9 @@ class LossWeights:
     scale: float
     area: float
     depth: float
+    """1 - the correlation with the inverse depths of `--depth`."""
+    agreed: float
+    """The error of the inverse depths on which few photos of a whole scene agree."""
     unseen: float
     """The term on views between few photos of an object with masks."""
 
@@ -131,7 +135,7 @@ class RunPlan:
             antialiased=config.antialiased,
             init=config.init,
             cell=config.cell,
-            weights=loss_weights(config, sparse, scene.has_alpha, scene.extent),
+            weights=loss_weights(config, sparse, scene.has_alpha, scene.extent, matches_photos(config, scene)),
             schedule=schedule,
             density=density_plan(config.density, budget, settings, scene.extent),
             poses=config.poses,
@@ -196,6 +200,7 @@ def make_schedule(
         sh_degree_every=optimizer["sh_degree_every"],
         settling=math.ceil(settings.settling_share * iterations),
         coarse_until=coarse_until(config.schedule.coarse_until, settings, iterations, pixels),
+        agreed_until=round(MATCHED_SHARE * iterations),
         max_sh_degree=min(degree, config.sparse.sh_degree) if few else degree,
         refine_start=density["refine_start"],
         refine_stop=refine_stop(config.density, iterations),
@@ -227,7 +232,9 @@ def refine_stop(config: DensityConfig, iterations: int) -> int:
     return min(published, round(share * iterations))
 
 
-def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool, extent: float) -> LossWeights:
+def loss_weights(
+    config: TrainConfig, sparse: bool, has_alpha: bool, extent: float, matched: bool = False
+) -> LossWeights:
     """The run's weights: LossConfig's (0.01 for mcmc's two, Kheradmand et al. 2024), or SparseConfig's if larger.
 
     Large splats are weighed by their scale in a scene, whose background needs some, and by their area on an object
@@ -238,14 +245,15 @@ def loss_weights(config: TrainConfig, sparse: bool, has_alpha: bool, extent: flo
     opacity = default if loss.lambda_opacity is None else loss.lambda_opacity
     scale = default if loss.lambda_scale is None else loss.lambda_scale
     if not sparse:
-        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, 0.0, loss.lambda_depth, unseen=0.0)
+        return LossWeights(loss.lambda_dssim, alpha, opacity, scale, 0.0, loss.lambda_depth, agreed=0.0, unseen=0.0)
     alpha = max(alpha, few.lambda_alpha)
     if has_alpha:
         opacity, area = max(opacity, few.lambda_opacity), few.lambda_area / extent**2
     else:
         opacity, area = max(opacity, OPAQUE_SHARE * few.lambda_opacity), 0.0
         scale = max(scale, few.lambda_scale)
-    return LossWeights(loss.lambda_dssim, alpha, opacity, scale, area, loss.lambda_depth, few.lambda_unseen)
+    depth, agreed = (0.0, loss.lambda_depth) if matched else (loss.lambda_depth, 0.0)
+    return LossWeights(loss.lambda_dssim, alpha, opacity, scale, area, depth, agreed, few.lambda_unseen)
 
 
 def density_plan(config: DensityConfig, budget: int, settings: OpenSettings, extent: float) -> DensityPlan:

@@ -34,6 +34,8 @@ class Schedule:
     """Number of last steps in which the learning rates fall."""
     coarse_until: tuple[int, ...]
     """Steps after which the resolution doubles."""
+    agreed_until: int
+    """Last step at which depths on which photos agree are a target."""
     max_sh_degree: int
     """Highest band of the spherical harmonics that the run stores."""
     refine_start: int

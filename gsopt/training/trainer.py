@@ -140,10 +140,12 @@ class Trainer:
         """Forward, loss, backward, regularizers; density control takes note."""
         dropout = self._dropout()
         drawn = self.model.gaussians if dropout is None else dropout.drawn
-        depth = self.plan.weights.depth > 0 and target.inverse_depths is not None
+        weights = self.plan.weights
+        wanted = weights.depth > 0 or (weights.agreed > 0 and self.step <= self._schedule.agreed_until)
+        depth = wanted and target.inverse_depths is not None
         frame = self.backend.forward(drawn, target.camera, settings, background, depth=depth)
         row = None if self.exposure is None else self.exposure.row(index)
-        loss = frame_loss(self.backend, frame, target, self.plan.weights, background, self.exposure, row, self.step)
+        loss = frame_loss(self.backend, frame, target, weights, background, self.exposure, row, self.step)
         bands = self._guidance is not None and self._guidance.is_due(self.step)  # which adds its own to them
         watches = self._density.watches(self.step, len(self.model))
         absgrad = watches and self.plan.density.absgrad

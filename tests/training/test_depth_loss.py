@@ -15,7 +15,7 @@ import torch
 from gsopt import load_scene
 from gsopt.config.train import TrainConfig
 from gsopt.geometry.cameras import opengl_from_viewmats
-from gsopt.training.frame_loss import depth_gradients
+from gsopt.training.frame_loss import MAX_ERROR, agreed_gradients, depth_gradients
 from gsopt.training.reconstruct import reconstruct
 from gsopt.training.targets import Target
 
@@ -69,6 +69,23 @@ def test_a_map_that_says_nothing_has_no_gradient(rendered: tuple[torch.Tensor, t
     ones = torch.ones(12, 14).double()
     assert not any(bool(part.any()) for part in depth_gradients(2 * ones, ones, target_of(slope), 1.0))
     assert not any(bool(part.any()) for part in depth_gradients(0 * ones, 0 * ones, target_of(slope), 1.0))
+
+
+def test_agreed_depths_pull_by_their_relative_error_unless_it_is_large(
+    rendered: tuple[torch.Tensor, torch.Tensor],
+) -> None:
+    generator = torch.Generator().manual_seed(9)
+    right = rendered[1] / rendered[0]
+    wanted = right * (1 + 0.6 * (torch.rand(12, 14, generator=generator).double() - 0.5))
+    wanted[2:4] = torch.nan
+    depths, alphas = (tensor.clone().requires_grad_() for tensor in rendered)
+    error = (alphas / depths / wanted - 1).abs()
+    near = torch.isfinite(wanted) & (alphas > 0.5) & (error < MAX_ERROR)
+    assert 0 < int(near.sum()) < int((torch.isfinite(wanted) & (alphas > 0.5)).sum())
+    (0.3 * error[near].sum() / error.numel()).backward()
+    found = agreed_gradients(*rendered, target_of(wanted), 0.3)
+    torch.testing.assert_close(found[0], depths.grad)
+    torch.testing.assert_close(found[1], alphas.grad)
 
 
 def room_dataset(folder: Path, inputs: int, held_out: int) -> Path:

@@ -19,7 +19,7 @@ from gsopt.training.targets import Target
 
 BACKEND = ReferenceBackend()
 GRAY = torch.tensor([0.3, 0.5, 0.7])
-WEIGHTS = LossWeights(dssim=0.2, alpha=0.0, opacity=0.0, scale=0.0, area=0.0, depth=0.1, unseen=0.0)
+WEIGHTS = LossWeights(dssim=0.2, alpha=0.0, opacity=0.0, scale=0.0, area=0.0, depth=0.1, agreed=0.0, unseen=0.0)
 
 
 @dataclass

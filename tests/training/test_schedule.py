@@ -116,22 +116,26 @@ def test_few_views_raise_weights_and_lower_bands_but_never_the_other_way() -> No
         loss=LossConfig(lambda_alpha=0.5), sparse=SparseConfig(below_views=4, lambda_alpha=0.1, sh_degree=1)
     )
     few, many = (plan.loss_weights(config, sparse, has_alpha=True, extent=2.0) for sparse in (True, False))
-    assert many == LossWeights(dssim=0.2, alpha=0.5, opacity=0.0, scale=0.0, area=0.0, depth=0.1, unseen=0.0)
+    assert many == LossWeights(
+        dssim=0.2, alpha=0.5, opacity=0.0, scale=0.0, area=0.0, depth=0.1, agreed=0.0, unseen=0.0
+    )
     photos = plan.loss_weights(config, sparse=True, has_alpha=False, extent=2.0)
     sparse = config.sparse
-    beside = {"dssim": 0.2, "alpha": 0.5, "depth": 0.1, "unseen": sparse.lambda_unseen}
+    beside = {"dssim": 0.2, "alpha": 0.5, "depth": 0.1, "agreed": 0.0, "unseen": sparse.lambda_unseen}
     assert few == LossWeights(**beside, opacity=sparse.lambda_opacity, scale=0.0, area=sparse.lambda_area / 4)
     haze = pytest.approx(sparse.lambda_opacity * plan.OPAQUE_SHARE)
     assert photos == LossWeights(**beside, opacity=haze, scale=sparse.lambda_scale, area=0.0)
+    matched = plan.loss_weights(config, sparse=True, has_alpha=False, extent=2.0, matched=True)
+    assert matched == replace(photos, depth=0.0, agreed=0.1)
     assert [is_sparse(config.sparse, views) for views in (4, 5)] == [True, False]
     assert (made(config, views=4).max_sh_degree, made(config, views=5).max_sh_degree) == (1, 3)
 
 
 def test_mcmc_regularizes_unless_its_weights_are_given() -> None:
     config = TrainConfig(density=DensityConfig(strategy="mcmc"))
-    assert plan.loss_weights(config, False, True, 2.0) == LossWeights(0.2, 0.0, 0.01, 0.01, 0.0, 0.1, 0.0)
+    assert plan.loss_weights(config, False, True, 2.0) == LossWeights(0.2, 0.0, 0.01, 0.01, 0.0, 0.1, 0.0, 0.0)
     quiet = replace(config, loss=LossConfig(lambda_opacity=0.0, lambda_scale=0.0))
-    assert plan.loss_weights(quiet, False, True, 2.0) == LossWeights(0.2, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0)
+    assert plan.loss_weights(quiet, False, True, 2.0) == LossWeights(0.2, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0)
 
 
 def test_dropout_rises_from_nothing_to_its_share_with_few_views_alone() -> None:

@@ -280,6 +280,22 @@ def test_depths_are_drawn_where_they_are_weighed_and_known(
 
 
 @torch.no_grad()
+def test_agreed_depths_are_drawn_in_the_first_third_of_a_run(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = made(replace(scene, train=tuple(replace(view, depth=torch.rand(4, 4)) for view in scene.train)))
+    weights = replace(trainer.plan.weights, depth=0.0, agreed=0.1)
+    trainer.plan = replace(trainer.plan, weights=weights)
+    trainer._schedule = replace(trainer._schedule, agreed_until=2)
+    wanted: list[bool] = []
+    forward = trainer.backend.forward
+    monkeypatch.setattr(
+        trainer.backend, "forward", lambda *args, depth: wanted.append(depth) or forward(*args, depth=depth)
+    )
+    for _ in range(4):
+        trainer.advance()
+    assert wanted == [True, True, False, False]
+
+
+@torch.no_grad()
 @pytest.mark.parametrize("distance", [0.0, 2.5])
 def test_gradients_weaken_near_a_camera_where_a_distance_is_set(
     scene: Scene, distance: float, monkeypatch: pytest.MonkeyPatch

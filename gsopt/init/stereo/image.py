@@ -16,6 +16,8 @@ from gsopt.init.thumbnails import Thumbnail
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 """Rec. 601."""
 _WIDTH_MULTIPLE = 8
+_WINDOW = 7
+"""Side of the window in which structure is looked for, px."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,15 @@ class StereoImage:
         return LUMA_WEIGHTS[0] * red + LUMA_WEIGHTS[1] * green + LUMA_WEIGHTS[2] * blue
 
     @cached_property
+    def structure(self) -> Float[Tensor, "H W"]:
+        """Root mean squared change of gray per pixel in a window, in the direction in which it changes least: near zero
+        on plain surfaces and along straight edges (Shi & Tomasi 1994)."""
+        padded = torch.nn.functional.pad(self.gray[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+        across, down = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2, (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
+        a, b, c = _window_mean(torch.stack([across * across, across * down, down * down]))
+        return ((a + c) / 2 - torch.hypot((a - c) / 2, b)).clamp(min=0).sqrt()
+
+    @cached_property
     def pixels(self) -> Float[Tensor, "2 H W"]:
         """Column and row of the pixels' centers."""
         rows, columns = torch.arange(self.camera.height) + 0.5, torch.arange(self.camera.width) + 0.5
@@ -58,3 +69,7 @@ class StereoImage:
         R, center = self.camera.viewmats[0, :3, :3], self.camera.centers[0]
         x, y = self.rays
         return torch.stack([(x * R[0, k] + y * R[1, k] + R[2, k]) / inverse_depths + center[k] for k in range(3)], -1)
+
+
+def _window_mean(planes: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
+    return torch.nn.functional.avg_pool2d(planes[None], _WINDOW, 1, _WINDOW // 2, count_include_pad=False)[0]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsopt.data.scene import AgreedPoints, Scene
 from gsopt.geometry.focus import Focus, find_focus
-from gsopt.geometry.projection import inside, project
+from gsopt.init.stereo.agreement import agreed
 from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.matching import Matcher
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, random_planes
@@ -27,10 +27,6 @@ LEVELS = ((8_000, 8, 1.0), (32_000, 3, 0.02))
 """Pixels, rounds, and first step of the search: coarse in small images, exact in larger ones."""
 NEAR_DEPTH, FAR_DEPTH = 0.25, 50.0
 """Depths that are searched, in distances to the focus."""
-MAX_DEPTH_DIFFERENCE, MAX_PIXEL_SHIFT, MAX_COST, MIN_ANGLE = 0.02, 2.0, 0.4, 1.0
-"""Two photos agree on a point if their depths differ by less than this share, it projects back to less than so many
-pixels away, both match at less than this cost, and they see it from directions so many degrees apart: a camera that
-only turns measures no depth."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +64,7 @@ def match_photos(scene: Scene, generator: torch.Generator) -> StereoMaps:
     photos = small_photos(scene.train, MAX_PHOTOS)
     focus = find_focus([view.camera for view in scene.train], scene.extent)
     maps = plane_maps(photos, focus, generator) if len(photos) > 1 else []
-    return StereoMaps(maps, [agreed(each, [other for other in maps if other is not each]) for each in maps])
+    return StereoMaps(maps, agreed(maps))
 
 
 def plane_maps(photos: Sequence[Thumbnail], focus: Focus, generator: torch.Generator) -> list[PlaneMap]:
@@ -98,29 +94,3 @@ def nearest(image: StereoImage, images: Sequence[StereoImage], focus: Focus) -> 
         return float(away + 2 * focus.distance * turned)
 
     return sorted((other for other in images if other is not image), key=distance)[:SOURCES_PER_PHOTO]
-
-
-def agreed(here: PlaneMap, others: Sequence[PlaneMap]) -> Bool[Tensor, "H W"]:
-    """Pixels whose point another photo places there as well."""
-    column, row = here.image.pixels
-    points = here.image.points(here.inverse_depths()).view(-1, 3)
-    found = torch.zeros(len(points), dtype=torch.bool)
-    for other in others:
-        camera = other.image.camera
-        there = project(camera, points)
-        rows = torch.nonzero(inside(camera, *there))[:, 0]
-        x, y = (there[0][rows].long().clamp(0, camera.width - 1), there[1][rows].long().clamp(0, camera.height - 1))
-        w = other.inverse_depths()
-        same_depth = (1 / w[y, x] / there[2][rows] - 1).abs() < MAX_DEPTH_DIFFERENCE
-        back = project(here.image.camera, other.image.points(w)[y, x])
-        moved = torch.hypot(back[0] - column.flatten()[rows], back[1] - row.flatten()[rows])
-        matched = (moved < MAX_PIXEL_SHIFT) & (other.costs[y, x] < MAX_COST)
-        found[rows] |= same_depth & matched & (_angles(points[rows], here.image, other.image) > MIN_ANGLE)
-    return found.view(here.costs.shape) & (here.costs < MAX_COST)
-
-
-def _angles(points: Float[Tensor, "N 3"], one: StereoImage, other: StereoImage) -> Float[Tensor, "N"]:
-    """Angles between the directions in which two cameras see points, degrees."""
-    a, b = points - one.camera.centers[0], points - other.camera.centers[0]
-    across = torch.linalg.cross(a, b).norm(dim=-1)
-    return torch.rad2deg(torch.atan2(across, (a * b).sum(-1)))

@@ -11,8 +11,9 @@ from torch import Tensor
 from gsopt.geometry.cameras import Cameras
 from gsopt.geometry.focus import Focus
 from gsopt.geometry.projection import project
+from gsopt.init.stereo.agreement import _angles, _confirmations
 from gsopt.init.stereo.image import StereoImage
-from gsopt.init.stereo.points import _angles, agreed, nearest
+from gsopt.init.stereo.points import nearest
 from gsopt.init.stereo.search import PlaneMap, Reach, Search, at, random_planes
 from gsopt.init.thumbnails import Thumbnail
 
@@ -160,8 +161,9 @@ def test_two_photos_agree_by_depth_place_cost_and_angle(
     width = 40 if focal < 100 else 400
     here = flat(image(width, 30, focal), 1 / 4, costs[0])
     there = flat(image(width, 30, focal, x=apart), 1 / depth, costs[1])
-    assert bool(agreed(here, [there])[15, width // 2]) == agree
-    assert not bool(agreed(here, []).any())
+    assert int(_confirmations(here, [there])[15, width // 2]) == agree
+    assert int(_confirmations(here, [there, there])[15, width // 2]) == 2 * agree
+    assert not bool(_confirmations(here, []).any())
 
 
 def test_angles_are_those_between_the_directions_to_two_cameras() -> None:
