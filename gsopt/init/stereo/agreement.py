@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from gsopt.geometry.projection import inside, project
-from gsopt.init.mask_parts import labels
-from gsopt.init.stereo.image import StereoImage
+from gsopt.init.stereo.image import StereoImage, window_mean
 from gsopt.init.stereo.search import PlaneMap
 
 MAX_DEPTH_DIFFERENCE, MAX_PIXEL_SHIFT, MAX_COST, MIN_ANGLE = 0.02, 2.0, 0.4, 1.0
@@ -19,8 +18,8 @@ pixels away, both match at less than this cost, and they see it from directions 
 only turns measures no depth."""
 SEEN_THROUGH = 0.95
 """A photo sees through a point that is nearer than this share of the depth it has there."""
-LEAST_PART = 0.003
-"""Share of the pixels from which on connected ones are no speck."""
+NEIGHBORHOOD, LEAST_BESIDE = 11, 0.4
+"""Side of the window around a pixel, px, and the share of it that must be believed too, or the pixel is a speck."""
 LEAST_STRUCTURE = 0.003
 """Change of gray per pixel, in the direction of the least, from which on a window matches one place alone."""
 
@@ -34,7 +33,7 @@ def agreed(maps: Sequence[PlaneMap]) -> list[Bool[Tensor, "H W"]]:
     for here, count in zip(maps, votes, strict=True):
         others = [(other, known) for other, known in zip(maps, confirmed, strict=True) if other is not here]
         believed = count > _views_through(here, others)
-        kept.append(believed & (_in_large_parts(believed) | (here.image.structure > LEAST_STRUCTURE)))
+        kept.append(believed & (_in_company(believed) | (here.image.structure > LEAST_STRUCTURE)))
     return kept
 
 
@@ -79,9 +78,8 @@ def _shown(
     return rows, (y, x), depth[rows]
 
 
-def _in_large_parts(kept: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-    parts = labels(kept)
-    return kept & (torch.bincount(parts.flatten()) >= LEAST_PART * kept.numel())[parts]
+def _in_company(believed: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    return window_mean(believed[None].float(), NEIGHBORHOOD)[0] > LEAST_BESIDE
 
 
 def _angles(points: Float[Tensor, "N 3"], one: StereoImage, other: StereoImage) -> Float[Tensor, "N"]:

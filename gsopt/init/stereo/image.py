@@ -48,7 +48,7 @@ class StereoImage:
         on plain surfaces and along straight edges (Shi & Tomasi 1994)."""
         padded = torch.nn.functional.pad(self.gray[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
         across, down = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2, (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
-        a, b, c = _window_mean(torch.stack([across * across, across * down, down * down]))
+        a, b, c = window_mean(torch.stack([across * across, across * down, down * down]), _WINDOW)
         return ((a + c) / 2 - torch.hypot((a - c) / 2, b)).clamp(min=0).sqrt()
 
     @cached_property
@@ -71,5 +71,6 @@ class StereoImage:
         return torch.stack([(x * R[0, k] + y * R[1, k] + R[2, k]) / inverse_depths + center[k] for k in range(3)], -1)
 
 
-def _window_mean(planes: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    return torch.nn.functional.avg_pool2d(planes[None], _WINDOW, 1, _WINDOW // 2, count_include_pad=False)[0]
+def window_mean(planes: Float[Tensor, "C H W"], side: int) -> Float[Tensor, "C H W"]:
+    """Mean over the part of a square window that lies in the image."""
+    return torch.nn.functional.avg_pool2d(planes[None], side, 1, side // 2, count_include_pad=False)[0]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsopt.geometry.cameras import Cameras
-from gsopt.init.stereo.agreement import LEAST_PART, LEAST_STRUCTURE, agreed
+from gsopt.init.stereo.agreement import LEAST_BESIDE, LEAST_STRUCTURE, NEIGHBORHOOD, agreed
 from gsopt.init.stereo.image import StereoImage
 from gsopt.init.stereo.search import PlaneMap
 
@@ -58,7 +58,7 @@ def test_a_speck_is_believed_where_the_photo_has_structure(plain: torch.Tensor, 
     here, other = (map_of(x, 0, noise if structured else plain) for x in (-0.1, 0.1))
     here.costs[:, 20:] = UNMATCHED
     speck = slice(30, 32), slice(50, 52)
-    assert LEAST_PART * HEIGHT * WIDTH > 4
+    assert LEAST_BESIDE * NEIGHBORHOOD**2 > 4
     here.costs[speck] = 0
     kept = agreed([here, other])[0]
     assert bool(kept[speck].all()) == bool(kept[speck].any()) == structured
