@@ -135,7 +135,8 @@ class LossConfig:
     lambda_alpha: Weight = 0.0
     """Weight of the L1 between rendered alpha and the image's alpha or mask."""
     lambda_depth: Weight = 0.1
-    """Weight of 1 - the correlation of rendered inverse depths with those of `--depth`, where there are some."""
+    """Weight of 1 - the correlation of rendered inverse depths with those of `--depth`, where there are some. Without
+    `--depth`, with few photos of a whole scene, that of their relative error where photos agree."""
     lambda_opacity: Weight | None = None
     """Weight of the mean opacity (Kheradmand et al. 2024); by default 0.01 with mcmc, 0 with adc."""
     lambda_scale: Weight | None = None

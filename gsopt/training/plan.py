@@ -40,7 +40,7 @@ NEAR_SHARE = 1.5
 HAZE_SHARE = 0.25
 # Photos up to which the depths on which they agree are a target, and the share of the run in which they are: true to
 # some percent, they put Gaussians where colors alone would not, and then colors know better (0042).
-MAX_MATCHED, MATCHED_SHARE = 10, 1 / 3
+MAX_MATCHED, MATCHED_SHARE = 12, 1 / 3
 # Most memory for float targets, as a share of the decoded images': both hold the same views.
 TARGET_CACHE_SHARE = 0.5
 

@@ -1,4 +1,4 @@
-"""What to believe of the planes that photos show: what the other photos confirm."""
+"""The depths to believe: those that other photos confirm, and do not see through."""
 
 from __future__ import annotations
 
