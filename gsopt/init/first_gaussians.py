@@ -21,8 +21,8 @@ from gsopt.init.thumbnails import mean_colors, small_photos
 
 ENOUGH_POINTS = 100
 """Sparse points from which on they beat the hull and random points."""
-ENOUGH_AGREED = 0.05
-"""Share of the pixels on which two photos must agree: photos of different rooms agree on 0.03 by chance."""
+ENOUGH_AGREED = 0.04
+"""Share of the pixels on which photos must agree: four of different rooms agree on 0.03 by chance."""
 FEW_PHOTOS = 16
 """Photos up to which stereo beats sparse points: it matches no more of them (docs/decisions/0041)."""
 _MAX_COLOR_PHOTOS = 16

@@ -14,6 +14,7 @@ from gsopt.config.train import InitConfig
 from gsopt.data.scene import AgreedPoints, Scene
 from gsopt.errors import UsageError
 from gsopt.init import first_gaussians
+from gsopt.init.first_gaussians import ENOUGH_AGREED
 from gsopt.init.stereo import stereo_points
 from gsopt.init.stereo.depths import with_stereo_depths
 from gsopt.raster.threads import one_torch_thread
@@ -59,7 +60,7 @@ def test_the_same_bits_for_any_number_of_threads(scene: Scene) -> None:
 
 
 def test_photos_that_were_matched_are_not_matched_again(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    matched = with_stereo_depths(scene, 0.05, seed=0)
+    matched = with_stereo_depths(scene, 0.04, seed=0)
     assert matched.agreed is not None
     monkeypatch.setattr("gsopt.init.stereo.points.match_photos", pytest.fail)
     found = points_of(matched)
@@ -73,7 +74,7 @@ def test_photos_that_were_matched_are_not_matched_again(scene: Scene, monkeypatc
 
 def test_photos_of_different_rooms_agree_on_next_to_nothing(tmp_path: Path) -> None:
     strangers = points_of(room_scene(tmp_path / "rooms", room.arc(4), seeds=[0, 1, 2, 3]))
-    assert strangers.share < 0.05
+    assert strangers.share < ENOUGH_AGREED
 
 
 def test_a_camera_that_only_turns_says_nothing_of_depth(tmp_path: Path) -> None:
