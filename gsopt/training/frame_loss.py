@@ -58,9 +58,9 @@ def frame_loss(
     if weights.alpha > 0 and target.alphas is not None:
         v_alphas = _sum(v_alphas, alpha_gradient(frame.alphas, target.alphas, weights.alpha * target.share))
     if target.inverse_depths is not None and frame.depths is not None:
-        matched = weights.agreed > 0
-        of, depth_weight = (agreed_gradients, weights.agreed) if matched else (depth_gradients, weights.depth)
-        through = of(frame.depths, frame.alphas, target, depth_weight * target.share)
+        gradients_of = agreed_gradients if weights.agreed > 0 else depth_gradients
+        depth_weight = weights.agreed or weights.depth
+        through = gradients_of(frame.depths, frame.alphas, target, depth_weight * target.share)
         v_depths, v_alphas = through[0], _sum(v_alphas, through[1])
     return FrameLoss(photometric.loss * weight, v_colors, v_alphas, v_depths)
 

@@ -131,6 +131,10 @@ def test_few_views_raise_weights_and_lower_bands_but_never_the_other_way() -> No
     assert (made(config, views=4).max_sh_degree, made(config, views=5).max_sh_degree) == (1, 3)
 
 
+def test_agreed_depths_are_a_target_in_the_first_third_of_a_run() -> None:
+    assert [made(TrainConfig(iterations=steps)).agreed_until for steps in (900, 4000)] == [300, 1333]
+
+
 def test_mcmc_regularizes_unless_its_weights_are_given() -> None:
     config = TrainConfig(density=DensityConfig(strategy="mcmc"))
     assert plan.loss_weights(config, False, True, 2.0) == LossWeights(0.2, 0.0, 0.01, 0.01, 0.0, 0.1, 0.0, 0.0)

@@ -280,7 +280,7 @@ def test_depths_are_drawn_where_they_are_weighed_and_known(
 
 
 @torch.no_grad()
-def test_agreed_depths_are_drawn_in_the_first_third_of_a_run(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agreed_depths_are_drawn_up_to_their_last_step(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = made(replace(scene, train=tuple(replace(view, depth=torch.rand(4, 4)) for view in scene.train)))
     weights = replace(trainer.plan.weights, depth=0.0, agreed=0.1)
     trainer.plan = replace(trainer.plan, weights=weights)

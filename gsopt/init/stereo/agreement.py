@@ -27,18 +27,13 @@ LEAST_STRUCTURE = 0.003
 def agreed(maps: Sequence[PlaneMap]) -> list[Bool[Tensor, "H W"]]:
     """Pixels of each photo whose point more photos confirm than see through; without specks where nothing has
     structure, which agree by chance (docs/decisions/0042-what-stereo-believes.md)."""
-    votes = [_confirmations(here, _others(here, maps)) for here in maps]
-    confirmed = [count > 0 for count in votes]
+    votes = [_confirmations(here, [other for other in maps if other is not here]) for here in maps]
     kept = []
     for here, count in zip(maps, votes, strict=True):
-        others = [(other, known) for other, known in zip(maps, confirmed, strict=True) if other is not here]
+        others = [(other, found > 0) for other, found in zip(maps, votes, strict=True) if other is not here]
         believed = count > _views_through(here, others)
         kept.append(believed & (_in_company(believed) | (here.image.structure > LEAST_STRUCTURE)))
     return kept
-
-
-def _others(here: PlaneMap, maps: Sequence[PlaneMap]) -> list[PlaneMap]:
-    return [other for other in maps if other is not here]
 
 
 def _confirmations(here: PlaneMap, others: Sequence[PlaneMap]) -> Int32[Tensor, "H W"]:

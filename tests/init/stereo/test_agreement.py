@@ -18,7 +18,7 @@ UNMATCHED = 1.0
 
 
 def map_of(x: float, y: float, rgb: torch.Tensor) -> PlaneMap:
-    """What a camera at (x, y, 0) that looks along z shows of the wall, matched everywhere."""
+    """The wall as a camera at (x, y, 0) shows it that looks along z, matched everywhere."""
     viewmat = torch.eye(4)
     viewmat[:2, 3] = -torch.tensor([x, y])
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
