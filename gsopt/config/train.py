@@ -25,7 +25,7 @@ MAX_GAUSSIANS = 100_000_000
 """More than any machine this runs on can hold."""
 MAX_COARSE_STEPS = 6
 """Halvings of the resolution at the first step."""
-GONE = {"density": ("grow_scale3d",)}
+GONE = {"density": ("grow_scale3d",), "sparse": ("lambda_scale",)}
 """Settings per section that older versions wrote and this one has not: they are ignored."""
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """Fixed backgrounds, RGB; `random` draws one per step."""
@@ -194,14 +194,13 @@ class SparseConfig:
     below_views: Count = 16
     """Largest number of input views with which they are active; 0 turns them off."""
     dropout: Annotated[float, Within(0, 0.95)] = 0.4
-    """Share of Gaussians left out of the last step, rising linearly from 0 (DropGaussian, Park et al. 2025)."""
+    """Largest share of Gaussians left out of a step; it rises linearly from 0, of an object with masks until the last
+    step (DropGaussian, Park et al. 2025), of a whole scene until half of the run, and falls again."""
     floater_every: Count = 500
     """Steps between two prunings by nearest-neighbor distance (GaussianObject, Yang et al. 2024), of an object with
     masks only where no silhouette needs what goes; 0 = never."""
     lambda_opacity: Weight = 0.03
     """Weight that replaces the one of LossConfig where this is larger."""
-    lambda_scale: Weight = 0.01
-    """Weight that replaces the one of LossConfig where this is larger, in a scene without masks."""
     lambda_area: Weight = 24.0
     """Weight of the mean squared scale of an object with masks, over its squared extent: small splats cost less."""
     lambda_alpha: Weight = 0.5

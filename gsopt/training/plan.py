@@ -33,7 +33,7 @@ MIN_BUDGET, MAX_BUDGET = 20_000, 1_000_000
 # more the images blur what the photos show (docs/decisions/0002-symmetry.md).
 MIRRORED_TIMES_VIEWS = 32
 # Share of SparseConfig's lambda_opacity without masks: in a scene nothing is transparent, and faded splats are haze.
-OPAQUE_SHARE = 1 / 6
+OPAQUE_SHARE = 1 / 3
 # Distance to a camera below which gradients are weakened, over the distance to what the cameras look at.
 NEAR_SHARE = 1.5
 # The same share, below which what is faint is haze (docs/decisions/0031-haze.md).
@@ -207,6 +207,7 @@ def make_schedule(
         refine_every=density["refine_every"],
         reset_every=config.density.reset_every,
         max_dropout=config.sparse.dropout if few else 0.0,
+        most_dropout_at=round(settings.most_dropout_share * iterations),
         floater_every=config.sparse.floater_every if few else 0,
         haze_every=config.density.haze_every,
     )
@@ -237,8 +238,8 @@ def loss_weights(
 ) -> LossWeights:
     """The run's weights: LossConfig's (0.01 for mcmc's two, Kheradmand et al. 2024), or SparseConfig's if larger.
 
-    Large splats are weighed by their scale in a scene, whose background needs some, and by their area on an object
-    with masks (docs/decisions/0030-area.md)."""
+    Large splats are weighed by their area on an object with masks (docs/decisions/0030-area.md), and not in a scene,
+    whose background needs some (docs/decisions/0043-opaque-scenes.md)."""
     loss, few = config.loss, config.sparse
     default = 0.01 if config.density.strategy == "mcmc" else 0.0
     alpha = loss.lambda_alpha
@@ -251,7 +252,6 @@ def loss_weights(
         opacity, area = max(opacity, few.lambda_opacity), few.lambda_area / extent**2
     else:
         opacity, area = max(opacity, OPAQUE_SHARE * few.lambda_opacity), 0.0
-        scale = max(scale, few.lambda_scale)
     depth, agreed = (0.0, loss.lambda_depth) if matched else (loss.lambda_depth, 0.0)
     return LossWeights(loss.lambda_dssim, alpha, opacity, scale, area, depth, agreed, few.lambda_unseen)
 

@@ -45,7 +45,9 @@ class Schedule:
     reset_every: int
     """Steps between two opacity resets of adc; 0 = never."""
     max_dropout: float
-    """Share of Gaussians left out of the last step."""
+    """Largest share of Gaussians left out of a step."""
+    most_dropout_at: int
+    """Step with the largest share."""
     floater_every: int
     """Steps between two prunings of floaters; 0 = never."""
     haze_every: int
@@ -106,8 +108,10 @@ class Schedule:
         return 0 < self.reset_every < step
 
     def dropout(self, step: int) -> float:
-        """Share of Gaussians left out of a step: rises linearly (DropGaussian, Park et al. 2025)."""
-        return self.max_dropout * step / self.iterations
+        """Share of Gaussians left out of a step: rises linearly (DropGaussian, Park et al. 2025), then falls to 0."""
+        if step <= self.most_dropout_at:
+            return self.max_dropout * step / self.most_dropout_at
+        return self.max_dropout * (self.iterations - step) / (self.iterations - self.most_dropout_at)
 
     def prunes_floaters(self, step: int) -> bool:
         """True when floaters are removed after this step; never after the last, which would leave holes."""

@@ -124,7 +124,7 @@ def test_few_views_raise_weights_and_lower_bands_but_never_the_other_way() -> No
     beside = {"dssim": 0.2, "alpha": 0.5, "depth": 0.1, "agreed": 0.0, "unseen": sparse.lambda_unseen}
     assert few == LossWeights(**beside, opacity=sparse.lambda_opacity, scale=0.0, area=sparse.lambda_area / 4)
     haze = pytest.approx(sparse.lambda_opacity * plan.OPAQUE_SHARE)
-    assert photos == LossWeights(**beside, opacity=haze, scale=sparse.lambda_scale, area=0.0)
+    assert photos == LossWeights(**beside, opacity=haze, scale=0.0, area=0.0)
     matched = plan.loss_weights(config, sparse=True, has_alpha=False, extent=2.0, matched=True)
     assert matched == replace(photos, depth=0.0, agreed=0.1)
     assert [is_sparse(config.sparse, views) for views in (4, 5)] == [True, False]
@@ -142,12 +142,27 @@ def test_mcmc_regularizes_unless_its_weights_are_given() -> None:
     assert plan.loss_weights(quiet, False, True, 2.0) == LossWeights(0.2, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0)
 
 
-def test_dropout_rises_from_nothing_to_its_share_with_few_views_alone() -> None:
+def test_dropout_of_few_views_of_an_object_rises_from_nothing_to_its_share() -> None:
     config = TrainConfig(iterations=100, sparse=SparseConfig(dropout=0.3))
-    few = made(config, views=4)
-    assert few.dropout(100) == pytest.approx(0.3)
-    assert few.dropout(1) == pytest.approx(0.003)
+    few = made(config, views=4, masked=True)
+    assert [few.dropout(step) for step in (1, 50, 100)] == pytest.approx([0.003, 0.15, 0.3])
     assert made(config).dropout(100) == 0
+
+
+def test_dropout_of_few_views_of_a_scene_falls_again_to_nothing() -> None:
+    few = made(TrainConfig(iterations=100, sparse=SparseConfig(dropout=0.3)), views=4)
+    assert [few.dropout(step) for step in (1, 50, 75, 100)] == pytest.approx([0.006, 0.3, 0.15, 0.0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(iterations=st.integers(1, 9000), masked=st.booleans())
+def test_dropout_never_passes_its_share_however_short_the_run(iterations: int, masked: bool) -> None:
+    config = TrainConfig(iterations=iterations)
+    run = made(config, views=4, masked=masked)
+    shares = [run.dropout(step) for step in range(1, run.iterations + 1)]
+    assert min(shares) >= 0
+    assert max(shares) <= config.sparse.dropout * (1 + 1e-12)
+    assert shares[-1] == pytest.approx(config.sparse.dropout if masked else 0)
 
 
 def test_haze_is_removed_now_and_then_and_after_the_last_step() -> None:
