@@ -36,10 +36,10 @@ def scene(views: int, **fields: Any) -> Any:
     return SimpleNamespace(**{"train": train, "extent": 3.0, "has_alpha": False, "completed": False, **fields})
 
 
-def test_haze_of_a_whole_scene_costs_a_sixth_of_what_it_costs_an_object() -> None:
+def test_haze_of_a_whole_scene_costs_a_third_of_what_it_costs_an_object() -> None:
     config = TrainConfig()
     masked, whole = (plan.loss_weights(config, sparse=True, has_alpha=alpha, extent=1.0) for alpha in (True, False))
-    assert masked.opacity == pytest.approx(6 * whole.opacity)
+    assert masked.opacity == pytest.approx(3 * whole.opacity)
     assert masked.opacity > 0
 
 

@@ -23,6 +23,7 @@ OTHER_VERBS = {
     "--depth",
     "--depth-kind",
     "--loss",
+    "--density",
 }
 
 
