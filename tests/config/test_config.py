@@ -47,7 +47,7 @@ def test_json_and_back_is_the_identity(views, steps, rate, stop, seed, path) -> 
 
 def test_a_run_of_an_older_version_is_read_without_settings_that_are_gone(tmp_path: Path) -> None:
     older = TrainConfig(iterations=12).to_dict()
-    older["density"]["grow_scale3d"] = 0.01
+    older["density"]["grow_scale3d"] = older["sparse"]["lambda_scale"] = 0.01
     (tmp_path / "config.json").write_text(json.dumps({"config": older}))
     assert TrainConfig.read(tmp_path / "config.json") == TrainConfig(iterations=12)
     with pytest.raises(InputError, match="grow_scale3d"):

@@ -23,7 +23,6 @@ OTHER_VERBS = {
     "--depth",
     "--depth-kind",
     "--loss",
-    "--density",
 }
 
 
