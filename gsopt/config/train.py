@@ -193,9 +193,9 @@ class SparseConfig:
 
     below_views: Count = 16
     """Largest number of input views with which they are active; 0 turns them off."""
-    dropout: Annotated[float, Within(0, 0.95)] = 0.4
-    """Largest share of Gaussians left out of a step; it rises linearly from 0, of an object with masks until the last
-    step (DropGaussian, Park et al. 2025), of a whole scene until half of the run, and falls again."""
+    dropout: Annotated[float, Within(0, 0.95)] | None = None
+    """Largest share of Gaussians left out of a step (DropGaussian, Park et al. 2025); it rises from 0 and falls again.
+    By default 0.4 at half of the run, of an object with masks 0.6 near its end."""
     floater_every: Count = 500
     """Steps between two prunings by nearest-neighbor distance (GaussianObject, Yang et al. 2024), of an object with
     masks only where no silhouette needs what goes; 0 = never."""

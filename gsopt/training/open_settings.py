@@ -5,8 +5,8 @@ need (docs/decisions/0019-fewer-steps.md). Early steps only move coarse shapes, 
 few photos of a whole scene keep them longer, lest fine detail is learned as view-dependent fog. Masks keep fog away:
 few views of an object need neither long coarse steps nor many, and small images lose what little they show
 (docs/decisions/0028-small-objects.md). Rates fall at the end, but not where few photos show a whole scene
-(docs/decisions/0032-settling.md). Dropout keeps Gaussians translucent, so that a whole scene ends without it
-(docs/decisions/0043-opaque-scenes.md).
+(docs/decisions/0032-settling.md). Dropout keeps Gaussians translucent, so that few views end without it: those of a
+whole scene early (docs/decisions/0043-opaque-scenes.md), those of an object late (0044-opaque-objects.md).
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ class OpenSettings:
     """Shares of the run after which the resolution is half and full; before, it is a quarter."""
     settling_share: float
     """Share of the run, its last, in which all rates fall, so that it does not end in the noise of single steps."""
+    dropout: float
+    """Largest share of Gaussians left out of a step."""
     most_dropout_share: float
-    """Share of the run after which most Gaussians are left out of a step; none are at the end, so that they become as
-    opaque as what they show."""
+    """Share of the run after which it is largest; none are left out at the end, so that Gaussians become as opaque as
+    what they show."""
     least_content: int
     """Fewest pixels that show something, mean over the photos, in an image smaller than a photo."""
 
@@ -68,6 +70,7 @@ MANY = OpenSettings(
     gaussians_per_pixel=1.44,
     coarse_shares=(0.06, 0.23),
     settling_share=0.05,
+    dropout=0.0,
     most_dropout_share=1.0,
     least_content=0,
 )
@@ -85,6 +88,7 @@ FEW_OF_A_SCENE = OpenSettings(
     gaussians_per_pixel=1.44,
     coarse_shares=(1 / 6, 1 / 2),
     settling_share=0.0,
+    dropout=0.4,
     most_dropout_share=0.5,
     least_content=0,
 )
@@ -95,7 +99,8 @@ FEW_OF_AN_OBJECT = replace(
     gaussians_per_pixel=1.72,
     coarse_shares=MANY.coarse_shares,
     settling_share=0.1,
-    most_dropout_share=1.0,
+    dropout=0.6,
+    most_dropout_share=0.85,
     least_content=4000,
 )
 

@@ -206,8 +206,8 @@ def make_schedule(
         refine_stop=refine_stop(config.density, iterations),
         refine_every=density["refine_every"],
         reset_every=config.density.reset_every,
-        max_dropout=config.sparse.dropout if few else 0.0,
-        most_dropout_at=round(settings.most_dropout_share * iterations),
+        max_dropout=settings.of(config.sparse)["dropout"] if few else 0.0,
+        most_dropout_at=math.floor(settings.most_dropout_share * iterations),
         floater_every=config.sparse.floater_every if few else 0,
         haze_every=config.density.haze_every,
     )
