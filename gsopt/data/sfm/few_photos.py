@@ -7,10 +7,14 @@ few of them each decision of an incremental mapper counts.
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -208,11 +212,13 @@ def _grown(project: ColmapProject, pairs: PairMatches, model: Any) -> Any:
 
 
 def _attempts(project: ColmapProject, pairs: PairMatches, where: str, focals: list[float | None]) -> Iterator[Attempt]:
-    """The best reconstruction with each focal length, adjusted."""
+    """The best reconstruction with each focal length, adjusted. Several starts are mapped at a time, each on one
+    thread, so that nothing depends on their number."""
     for focal in focals:
         counts = verify(project, pairs, focal=focal)
         firsts = [None, *sorted(counts, key=lambda pair: (-counts[pair], pair))[:FIRST_PAIRS]]
-        mapped = [model for first in firsts for model in _mapped(project, first)]
+        with ThreadPoolExecutor(project.config.threads or os.cpu_count()) as pool:
+            mapped = [model for models in pool.map(partial(_mapped, project), firsts) for model in models]
         if mapped:
             most = max((Attempt(model, where) for model in mapped), key=lambda attempt: attempt.support)
             yield Attempt(bundle_adjusted(project, most.reconstruction, lens=False), where)
@@ -296,13 +302,11 @@ def _mapped(project: ColmapProject, first: tuple[int, int] | None, start: Path |
     if first is not None:
         options.init_image_id1, options.init_image_id2 = first
     options.multiple_models = False
-    target = project.database.with_name("attempt")
-    shutil.rmtree(target, ignore_errors=True)
-    target.mkdir()
-    project.pycolmap.set_random_seed(project.config.seed)
-    models = project.pycolmap.incremental_mapping(
-        project.database, project.photos, target, options=options, input_path=start
-    )
+    project.pycolmap.set_random_seed(project.config.seed)  # each thread has numbers of its own
+    with tempfile.TemporaryDirectory(dir=project.database.parent) as target:
+        models = project.pycolmap.incremental_mapping(
+            project.database, project.photos, Path(target), options=options, input_path=start
+        )
     for model in models.values():
         keep_coherent(model)
     return [model for _, model in sorted(models.items()) if len(registered(model)) >= SMALLEST_MODEL]

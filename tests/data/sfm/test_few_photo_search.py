@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -196,3 +197,22 @@ def test_features_lie_within_three_px_of_their_lines_and_a_turntable_turns_by_si
     assert (options.ransac.max_error, options.ransac.min_inlier_ratio, options.min_num_inliers) == (3.0, 0.1, 18)
     few_photos.verify(project, pairs, "model", only={1})
     assert asked[2:] == [("model", None)]
+
+
+def test_of_equal_results_the_first_start_wins_even_where_it_ends_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = threading.Semaphore(0)
+
+    def mapped(project: object, first: tuple[int, int] | None) -> list[Reconstruction]:
+        if first is not None:
+            ended.release()
+        elif not (ended.acquire(timeout=60) and ended.acquire(timeout=60)):
+            raise TimeoutError("The other starts wait for the first one.")
+        return [model(3 if first is None else 4, 0)]
+
+    monkeypatch.setattr(few_photos, "verify", lambda *_, focal: {(1, 2): 50, (1, 3): 90})
+    monkeypatch.setattr(few_photos, "_mapped", mapped)
+    monkeypatch.setattr(few_photos, "bundle_adjusted", lambda project, one, lens: one)
+    project: Any = SimpleNamespace(config=SfmConfig(threads=2))
+    pairs: Any = None
+    (attempt,) = few_photos._attempts(project, pairs, "the masks", [None])
+    assert attempt.photos == 3

@@ -216,6 +216,7 @@ def test_few_photos_are_mapped_with_the_lens_held(tmp_path: Path) -> None:
 
     def incremental(database: Path, photos: Path, target: Path, *, options: Any, input_path: object) -> dict[int, Any]:
         ran.append((options, input_path, list(target.iterdir())))
+        (target / "left").touch()
         models = {2: Reconstruction([1, 2, 3], shared(20, 1, 2, 3)), 1: Reconstruction([1, 2, 3], shared(20, 1, 2))}
         return {**models, 0: Reconstruction([4, 5, 6], shared(15, 4, 5, 6))}
 
@@ -230,7 +231,7 @@ def test_few_photos_are_mapped_with_the_lens_held(tmp_path: Path) -> None:
         assert [model.photos for model in models] == [{4, 5, 6}, {1, 2, 3}]
         options, start, there = ran[-1]
         assert (start, there) == ("", [])
-        (tmp_path / "attempt" / "left").touch()
+        assert list(tmp_path.iterdir()) == []
         held = (options.ba_refine_focal_length, options.ba_refine_extra_params, options.multiple_models)
         assert held == (False, False, False)
         assert not options.structure_less_registration_fallback
@@ -304,6 +305,8 @@ def test_focal_lengths_are_tried_where_one_is_not_known(known: list[bool], focal
 def test_mapping_starts_from_the_five_best_pairs_too_and_the_best_result_is_adjusted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    project: Any = SimpleNamespace(config=SfmConfig(threads=1))
+    pairs: Any = None
     counts = {(1, 2): 50, (1, 3): 90, (2, 3): 90, (1, 4): 10, (2, 4): 20, (3, 4): 70}
     starts: list[Any] = []
 
@@ -314,13 +317,13 @@ def test_mapping_starts_from_the_five_best_pairs_too_and_the_best_result_is_adju
     monkeypatch.setattr(few_photos, "verify", lambda project, pairs, focal: {} if focal == 1.9 else counts)
     monkeypatch.setattr(few_photos, "_mapped", mapped)
     monkeypatch.setattr(few_photos, "bundle_adjusted", lambda project, model, lens: (model, lens))
-    attempts = list(few_photos._attempts(None, None, "the masks", [1.2, 1.9]))  # type: ignore[arg-type]
+    attempts = list(few_photos._attempts(project, pairs, "the masks", [1.2, 1.9]))
     assert starts == [None, (1, 3), (2, 3), (3, 4), (1, 2), (2, 4), None]
     assert [attempt.hypothesis for attempt in attempts] == ["the masks"] * 2
     model, lens = attempts[0].reconstruction
     assert (len(model.all_points), lens) == (30, False)
     monkeypatch.setattr(few_photos, "_mapped", lambda project, first: [])
-    assert list(few_photos._attempts(None, None, "", [None])) == []  # type: ignore[arg-type]
+    assert list(few_photos._attempts(project, pairs, "", [None])) == []
 
 
 class Pairs:
