@@ -287,7 +287,8 @@ def _lenses(project: ColmapProject, db: Any, model: Any | None, focal: float | N
 
 
 def _mapped(project: ColmapProject, first: tuple[int, int] | None, start: Path | str = "") -> list[Any]:
-    """Incremental reconstructions with the lens held, from a first pair or from a reconstruction."""
+    """Incremental reconstructions with the lens held, from a first pair or from a reconstruction. In a copy of the
+    database: COLMAP writes to a database that it opens, and refuses one that another thread has just locked."""
     options = incremental_options(project)
     options.min_num_matches = MIN_INLIERS
     options.extract_colors = False
@@ -301,11 +302,13 @@ def _mapped(project: ColmapProject, first: tuple[int, int] | None, start: Path |
     mapper.abs_pose_min_inlier_ratio = 0.25
     if first is not None:
         options.init_image_id1, options.init_image_id2 = first
+        options.init_num_trials = 1  # a pair that does not suit would be tried 800 times, for a minute
     options.multiple_models = False
     project.pycolmap.set_random_seed(project.config.seed)  # each thread has numbers of its own
-    with tempfile.TemporaryDirectory(dir=project.database.parent) as target:
+    with tempfile.TemporaryDirectory(dir=project.database.parent) as folder:
+        database = Path(shutil.copyfile(project.database, Path(folder, "database.db")))
         models = project.pycolmap.incremental_mapping(
-            project.database, project.photos, Path(target), options=options, input_path=start
+            database, project.photos, Path(folder), options=options, input_path=start
         )
     for model in models.values():
         keep_coherent(model)

@@ -215,8 +215,9 @@ def test_few_photos_are_mapped_with_the_lens_held(tmp_path: Path) -> None:
     ran: list[Any] = []
 
     def incremental(database: Path, photos: Path, target: Path, *, options: Any, input_path: object) -> dict[int, Any]:
-        ran.append((options, input_path, list(target.iterdir())))
-        (target / "left").touch()
+        ran.append((options, input_path, database.read_text()))
+        assert list(target.iterdir()) == [database]
+        database.write_text("written to")
         models = {2: Reconstruction([1, 2, 3], shared(20, 1, 2, 3)), 1: Reconstruction([1, 2, 3], shared(20, 1, 2))}
         return {**models, 0: Reconstruction([4, 5, 6], shared(15, 4, 5, 6))}
 
@@ -226,12 +227,14 @@ def test_few_photos_are_mapped_with_the_lens_held(tmp_path: Path) -> None:
     project: Any = SimpleNamespace(
         pycolmap=colmap, config=SfmConfig(seed=5), database=tmp_path / "a.db", photos=tmp_path
     )
+    project.database.write_text("features")
     for first in (None, (3, 4)):
         models = few_photos._mapped(project, first)
         assert [model.photos for model in models] == [{4, 5, 6}, {1, 2, 3}]
-        options, start, there = ran[-1]
-        assert (start, there) == ("", [])
-        assert list(tmp_path.iterdir()) == []
+        options, start, copied = ran[-1]
+        assert (start, copied) == ("", "features")
+        assert list(tmp_path.iterdir()) == [project.database]
+        assert project.database.read_text() == "features"
         held = (options.ba_refine_focal_length, options.ba_refine_extra_params, options.multiple_models)
         assert held == (False, False, False)
         assert not options.structure_less_registration_fallback
@@ -243,6 +246,7 @@ def test_few_photos_are_mapped_with_the_lens_held(tmp_path: Path) -> None:
         assert (options.mapper.init_min_tri_angle, options.mapper.abs_pose_min_inlier_ratio) == (6.0, 0.25)
         assert getattr(options, "init_image_id1", None) == (first and first[0])
         assert getattr(options, "init_image_id2", None) == (first and first[1])
+        assert getattr(options, "init_num_trials", None) == (first and 1)
 
 
 @pytest.mark.parametrize(("focal", "free"), [(None, True), (900.0, False)])
