@@ -124,7 +124,9 @@ class GsoptScene(bpy.types.PropertyGroup):
 
     preset: EnumProperty(name="Preset", items=PRESETS, default="default")  # type: ignore[valid-type]
     iterations: IntProperty(name="Steps", default=4000, min=1)  # type: ignore[valid-type]
-    downscale: IntProperty(name="Divide Size by", default=1, min=1, max=16)  # type: ignore[valid-type]
+    downscale: IntProperty(
+        name="Divide Size by", default=0, min=0, max=16, description="1: all pixels; 0: at most 1600 px on a side"
+    )  # type: ignore[valid-type]
     budget: IntProperty(name="Most Gaussians", default=0, min=0, description="0: as many as the images call for")  # type: ignore[valid-type]
     views: IntProperty(name="Input Views", default=0, min=0, description="Learn from this many; 0: all")  # type: ignore[valid-type]
     hold_out: BoolProperty(name="Hold out Every 8th", default=False)  # type: ignore[valid-type]

@@ -15,8 +15,8 @@ class Training:
     preset: str = ""
     """draft, default or high; empty: steps and size as given here."""
     iterations: int = 4000
-    downscale: int = 1
-    """Width and height are divided by this."""
+    downscale: int = 0
+    """Width and height are divided by this; 0: photos have at most 1600 px on a side."""
     max_gaussians: int = 0
     """0: as many as the images call for."""
     views: int = 0
@@ -63,7 +63,7 @@ def own(training: Training) -> list[str]:
     """Options that the panel offers in place of a preset."""
     words = ["--iterations", str(training.iterations), "--strategy", training.strategy]
     words += ["--background", training.background]
-    words += ["--resolution", str(training.downscale)] if training.downscale > 1 else []
+    words += ["--resolution", str(training.downscale)] if training.downscale else []
     return words + (["--eval"] if training.hold_out else [])
 
 

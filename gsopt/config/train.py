@@ -42,8 +42,9 @@ class DataConfig:
     """Number of input views to learn from, well spread by camera position; all by default."""
     view_ids: tuple[int, ...] | None = None
     """Exactly these input views, 0-based in name order, e.g. 2,16,26."""
-    downscale: PositiveCount = 1
-    """Divisor of width and height (area filter)."""
+    downscale: PositiveCount | None = None
+    """Divisor of width and height (area filter); 1 keeps all pixels. By default the longer side of a larger photo
+    becomes 1600 px."""
     eval: bool = False
     """Hold out every 8th image when the dataset has no test split of its own."""
     background: Literal["auto", "white", "black", "random"] = "auto"

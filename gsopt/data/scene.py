@@ -35,6 +35,8 @@ FAR_FROM_ORIGIN = 1e3
 """Scenes farther from the origin than this many extents are moved there: float32 would lose their detail."""
 MAX_COORDINATE = 1e18
 """Its square is finite in float32."""
+LONGEST_SIDE = 1600
+"""Longer side of a photo beyond which it is reduced where no divisor is given, px (as in Kerbl et al. 2023)."""
 LEAST_SIDE = 16
 """Shorter side below which no divisor may take an image, px: somebody gave the size that they want."""
 FARTHEST_POINT = 1e6
@@ -189,6 +191,11 @@ def load_scene(config: DataConfig | str | Path) -> Scene:
     origin = _origin(dataset.frames + (dataset.held_out or []), warnings)  # the same whichever views are chosen
     depths = _depth_files(train, config, warnings)  # held-out views need none
     views, has_alpha = _views(root, train + test, depths, origin, config)
+    longest = max(max(frame.width, frame.height) for frame in train)
+    if config.downscale is None and longest > LONGEST_SIDE:
+        warnings.append(
+            f"Photos of up to {longest:,} px are learned at {LONGEST_SIDE:,} px: `--resolution 1` keeps all pixels."
+        )
     return Scene(
         path=root,
         kind=dataset.kind,
@@ -283,12 +290,13 @@ def _views(
 
 
 def _prepare(
-    root: Path, frame: PosedImage, factor: int, pinholes: dict[tuple[object, ...], Undistortion]
+    root: Path, frame: PosedImage, divisor: int | None, pinholes: dict[tuple[object, ...], Undistortion]
 ) -> tuple[ImageSource, Tensor, bool]:
     """The source of the frame's pixels, the pinhole K at working size, and True when there is alpha."""
-    path, stored = _stored_image(root, frame, factor)
+    path, stored = _stored_image(root, frame, divisor or 1)
+    factor = divisor or max(1.0, max(frame.width, frame.height) / LONGEST_SIDE)
     width, height = (downscaled_size(extent, factor) for extent in (frame.width, frame.height))
-    if min(width, height) < LEAST_SIDE <= min(frame.width, frame.height) / 4:
+    if divisor and min(width, height) < LEAST_SIDE <= min(frame.width, frame.height) / 4:
         raise UsageError(
             f"`--resolution` divides width and height: {factor} leaves {width} x {height} px of {frame.name}, "
             f"{frame.width} x {frame.height} px. Give 2 for half the size, 4 for a quarter."

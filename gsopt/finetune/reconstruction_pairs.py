@@ -97,7 +97,7 @@ def make_pairs(folder: Path, size: int, index: int, seed: int, backend: Backend)
 
 def whole_scene(folder: Path, size: int) -> Scene:
     """Loads all views of a scene as input views, about `size` px."""
-    full = load_scene(DataConfig(path=str(folder)))
+    full = load_scene(DataConfig(path=str(folder), downscale=1))
     side = min(min(view.camera.width, view.camera.height) for view in full.train)
     scene = load_scene(DataConfig(path=str(folder), downscale=max(1, side // size)))
     views = scene.train + scene.test

@@ -150,7 +150,11 @@ def test_gsopt_takes_the_flags(
     assert config.preset == (training.preset or "default")
     preset = PRESETS[training.preset or "default"]
     own = training if not training.preset else arguments.Training(iterations=preset.get("iterations", 4000))
-    assert (config.iterations, config.data.downscale, config.seed) == (own.iterations, own.downscale, training.seed)
+    assert (config.iterations, config.data.downscale or 0, config.seed) == (
+        own.iterations,
+        own.downscale,
+        training.seed,
+    )
     assert (config.data.views or 0, config.density.max_gaussians or 0) == (training.views, training.max_gaussians)
     assert (config.density.strategy, config.data.background) == (own.strategy, own.background)
     assert (config.threads, config.backend, config.data.eval) == (training.threads, training.backend, own.hold_out)
@@ -244,7 +248,7 @@ def test_what_the_panel_begins_with_is_what_gsopt_does_by_itself(tmp_path: Path)
     plain, _ = read_flags(parse([str(tmp_path), "-m", str(tmp_path / "run")]))
     # A number of steps that somebody names is not stretched for few photos.
     assert replace(asked, preview_every=plain.preview_every, sparse=plain.sparse) == plain
-    assert (training.downscale, training.max_gaussians, training.views, training.hold_out) == (1, 0, 0, False)
+    assert (training.downscale, training.max_gaussians, training.views, training.hold_out) == (0, 0, 0, False)
     assert (guidance.weight, guidance.references, guidance.front_view) == (DEFAULT_WEIGHT, (), -1)
 
 

@@ -144,7 +144,7 @@ def test_every_setting_has_one_flag_with_its_default_and_help(capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("argv", "error"),
     [
-        ("--resolution 0", "`--resolution` must be at least 1, got 0. Leave it out for the default of 1."),
+        ("--resolution 0", "`--resolution` must be at least 1, got 0. Leave it out for the default."),
         ("--iterations 0", "`--iterations` must be at least 1, got 0. Leave it out for the default of 4000."),
         ("--optimizer.lr_last 2", "`--optimizer.lr-last` must lie in [1e-06, 1], got 2.0."),
         ("--views 2 --view-ids 1", "`--views` and `--view-ids` were both given. Keep one of them."),

@@ -67,6 +67,32 @@ def test_a_resolution_that_leaves_less_than_16_pixels_of_a_real_photo_is_refused
             load_scene(config)
 
 
+@pytest.mark.parametrize(
+    ("size", "divisor", "working"),
+    [
+        ((1600, 40), None, (1600, 40)),
+        ((1601, 40), None, (1600, 40)),
+        ((40, 4000), None, (16, 1600)),
+        ((40, 4000), 1, (40, 4000)),
+        ((4000, 90), 2, (2000, 45)),
+    ],
+)
+def test_large_photos_are_learned_at_1600_pixels_unless_a_divisor_is_given(
+    tmp_path: Path, size: tuple[int, int], divisor: int | None, working: tuple[int, int]
+) -> None:
+    nerfstudio(tmp_path, size=size)
+    scene = load_scene(DataConfig(path=str(tmp_path), downscale=divisor))
+    view = scene.train[0]
+    assert (view.camera.width, view.camera.height) == working
+    assert view.pixels().shape == (working[1], working[0], 3)
+    reduced = divisor is None and max(size) > 1600
+    said = [f"Photos of up to {max(size):,} px are learned at 1,600 px: `--resolution 1` keeps all pixels."]
+    assert [warning for warning in scene.warnings if "are learned at" in warning] == (said if reduced else [])
+    whole = load_scene(DataConfig(path=str(tmp_path), downscale=1)).train[0].camera
+    ratio = torch.tensor([working[0] / size[0], working[1] / size[1]])
+    assert torch.allclose(view.camera.Ks[0, :2], whole.Ks[0, :2] * ratio[:, None])
+
+
 @pytest.mark.parametrize(("width", "fine"), [(5, True), (6, True), (7, False), (4, False)])
 def test_a_published_smaller_image_may_be_rounded_either_way(tmp_path: Path, width: int, fine: bool) -> None:
     """A third of 16 is 5.33: both 5 and 6 occur, and nothing farther."""

@@ -98,6 +98,15 @@ def test_pairs_are_made_of_views_that_were_held_out(pairs: Pairs) -> None:
     assert int(pairs.uncertainty.max()) > 0
 
 
+def test_a_scene_has_about_the_size_asked_for_however_large_its_photos_are(
+    scenes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """24 px."""
+    monkeypatch.setattr("gsopt.data.scene.LONGEST_SIDE", 8)
+    camera = whole_scene(scenes / "one", 12).train[0].camera
+    assert (camera.width, camera.height) == (12, 12)
+
+
 def test_mirror_images_count_as_input_views(scenes: Path) -> None:
     """As in a run: what they show is less uncertain."""
     scene = whole_scene(scenes / "one", SIZE)

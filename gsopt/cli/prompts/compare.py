@@ -44,8 +44,8 @@ class Flags:
     """Input view (0-based) that shows the front."""
     clip: str = ""
     """CLIP model for alignment scores, where the prior has none."""
-    resolution: Annotated[int, arg(aliases=["-r"])] = 1
-    """Divide width and height by this."""
+    resolution: Annotated[int | None, arg(aliases=["-r"])] = None
+    """Divide width and height by this; by default the longer side of a larger photo becomes 1600 px."""
     seed: int = 0
     """Same seed, same data, same bits."""
     threads: int = 0

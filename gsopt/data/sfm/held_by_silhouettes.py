@@ -92,7 +92,8 @@ def _views(reconstruction: Any, inputs: FeatureInput, folder: Path) -> tuple[Vie
     if inputs.masks is None or names & set(inputs.unmasked):
         return ()
     shutil.rmtree(folder, ignore_errors=True)
-    return load_scene(DataConfig(path=str(found_scene(reconstruction, folder, inputs)), cache_mb=0)).train
+    found = found_scene(reconstruction, folder, inputs)
+    return load_scene(DataConfig(path=str(found), downscale=1, cache_mb=0)).train
 
 
 def loosely_held(reconstruction: Any, photos: set[int]) -> bool:

@@ -120,7 +120,7 @@ def _write_as_taken(reconstruction: Any, found: Path, scene: Path) -> None:
 
 def _write_undistorted(pycolmap: ModuleType, reconstruction: Any, found: Path, scene: Path) -> None:
     """Pinhole photos, as gsopt's own loader would make them; a mask becomes their alpha."""
-    views = load_scene(DataConfig(path=str(found), cache_mb=0)).train
+    views = load_scene(DataConfig(path=str(found), downscale=1, cache_mb=0)).train
     images = {reconstruction.image(i).name: reconstruction.image(i) for i in reconstruction.reg_image_ids()}
     pinholes: dict[int, list[float]] = {}
     for view in views:

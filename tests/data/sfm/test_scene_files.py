@@ -122,13 +122,18 @@ def test_photos_as_they_were_taken_keep_their_lens_and_their_masks(tmp_path: Pat
     assert (frame["camera_model"], frame["k1"], frame["fl_x"]) == ("OPENCV", 0.1, FOCAL)
 
 
-def test_an_undistorted_scene_sees_its_points_through_pinholes_exactly(tmp_path: Path) -> None:
-    """These are the pinholes of the photos as gsopt undistorts them. JPEGs keep the colors of every pixel."""
+@pytest.mark.parametrize("longest", [1600, WIDTH // 2])
+def test_an_undistorted_scene_sees_its_points_through_pinholes_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, longest: int
+) -> None:
+    """These are the pinholes of the photos as gsopt undistorts them, at their size, even where training reduces it.
+    JPEGs keep the colors of every pixel."""
+    monkeypatch.setattr("gsopt.data.scene.LONGEST_SIDE", longest)
     names = ("a.jpg", "b.jpg")
     inputs = taken(tmp_path, *names)
     made = reconstruction(*names, model="OPENCV", distortion=(0.1, 0.0, 0.0, 0.0))
     scene = write_scene(pycolmap, made, tmp_path, inputs, PLACED, True)
-    K = load_scene(DataConfig(path=str(tmp_path / "found"))).train[0].camera.Ks[0]
+    K = load_scene(DataConfig(path=str(tmp_path / "found"), downscale=1)).train[0].camera.Ks[0]
     assert made.camera(1).params.tolist() == [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
     assert len(set(made.camera(1).params)) == 4
     assert made.camera(1).model.name == "PINHOLE"
@@ -136,7 +141,7 @@ def test_an_undistorted_scene_sees_its_points_through_pinholes_exactly(tmp_path:
     for name in names:
         with Image.open(scene / "images" / name) as image:
             assert JpegImagePlugin.get_sampling(image) == 0
-            assert image.size == (made.camera(1).width, made.camera(1).height)
+            assert image.size == (made.camera(1).width, made.camera(1).height) == (WIDTH, HEIGHT)
     read = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
     assert read.camera(1).params.tolist() == made.camera(1).params.tolist()
 

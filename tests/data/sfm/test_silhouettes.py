@@ -252,12 +252,18 @@ def test_advice_or_refusal_follows_where_no_poses_near_fit_the_masks(
     assert "do not fit these poses" in advice[0]
 
 
-def test_misses_of_a_reconstruction_are_those_of_the_best_poses_near_it(work: Path, views: tuple[View, ...]) -> None:
+def test_misses_of_a_reconstruction_are_those_of_the_best_poses_near_it(
+    work: Path, views: tuple[View, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In pixels of the photos, whatever size they are learned at."""
     pycolmap = pytest.importorskip("pycolmap")
     names, folder = names_of(views), work / "held"
     inputs = FeatureInput(work / "photos", work / "photos", "alpha", [])
     near = reconstruction(pycolmap, views, disturbed(views, 0.5), names)
-    assert 0 < outline_misses(near, inputs, folder) < 0.5
+    misses = outline_misses(near, inputs, folder)
+    assert 0 < misses < 0.5
+    monkeypatch.setattr("gsopt.data.scene.LONGEST_SIDE", 20)
+    assert outline_misses(near, inputs, folder) == misses
     wrong = misplaced(views, (0, 2, 4, 6))
     assert outline_misses(reconstruction(pycolmap, wrong, wrong, names), inputs, folder) > REFUTED
     one = misplaced(views, (2,))
