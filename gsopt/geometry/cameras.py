@@ -86,6 +86,17 @@ class Cameras:
             cameras[0], viewmats=torch.cat([c.viewmats for c in cameras]), Ks=torch.cat([c.Ks for c in cameras])
         )
 
+    @staticmethod
+    def of_one_size(cameras: list[Cameras]) -> Cameras:
+        """One batch with the image size of the first: others fill it, and what stands out of it is cut off."""
+        return Cameras.cat([camera._filling(cameras[0].width, cameras[0].height) for camera in cameras])
+
+    def _filling(self, width: int, height: int) -> Cameras:
+        scale = max(width / self.width, height / self.height)
+        Ks = self.Ks * self.Ks.new_tensor([scale, scale, 1])[:, None]
+        Ks[:, :, 2] += Ks.new_tensor([(width - scale * self.width) / 2, (height - scale * self.height) / 2, 0])
+        return replace(self, Ks=Ks, width=width, height=height)
+
 
 def intrinsics(fov_x: float, width: int, height: int) -> Float[Tensor, "3 3"]:
     """Square-pixel intrinsics, principal point in the middle, from the horizontal field of view in radians."""

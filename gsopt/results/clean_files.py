@@ -125,7 +125,7 @@ def write_picture(run: FinishedRun, keep: Bool[Tensor, "N"], views: tuple[View, 
 
 def picture(run: FinishedRun, keep: Bool[Tensor, "N"], views: tuple[View, ...]) -> Image.Image:
     """Before, after and what goes in red, from the first input camera and two places of the turntable."""
-    cameras = Cameras.cat([view.camera.resized(views[0].camera.width, views[0].camera.height) for view in views])
+    cameras = Cameras.of_one_size([view.camera for view in views])
     path = turntable_path(cameras, ROWS, look_at_point(run.gaussians, cameras))
     shots = [views[0].camera, *(path[i] for i in range(1, ROWS))]
     columns = [run.gaussians, run.gaussians.select(keep), marked(run.gaussians.select(~keep))]

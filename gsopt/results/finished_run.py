@@ -13,7 +13,7 @@ from gsopt.config.train import BACKGROUNDS, TrainConfig
 from gsopt.data import files
 from gsopt.data.refined_poses import with_refined_poses
 from gsopt.data.resample import premultiply
-from gsopt.data.scene import Scene, View, load_scene
+from gsopt.data.scene import View, load_scene
 from gsopt.errors import InputError
 from gsopt.formats import load_splats
 from gsopt.gaussians import Gaussians
@@ -129,7 +129,7 @@ def cameras_along(run: FinishedRun, path: str, count: int, longest: int | None =
     elif path.endswith(".json"):
         shots = [(f"{i:04d}", camera) for i, camera in enumerate(read_camera_path(Path(path), scene.origin))]
     else:
-        cameras = Cameras.cat([view.camera.resized(*_first_size(scene)) for view in scene.train])
+        cameras = Cameras.of_one_size([view.camera for view in scene.train])
         path_cameras = camera_path(run, cameras, path, count)
         shots = [(f"{index:04d}", path_cameras[index]) for index in range(len(path_cameras))]
     return [(name, camera if longest is None else with_longest_side(camera, longest)) for name, camera in shots]
@@ -167,7 +167,3 @@ def render_video(
 ) -> None:
     """Writes a video in the format that the suffix of `output` names."""
     save_video(output, (run.draw(camera) for _, camera in shots), fps, overwrite=overwrite)
-
-
-def _first_size(scene: Scene) -> tuple[int, int]:
-    return scene.train[0].camera.width, scene.train[0].camera.height

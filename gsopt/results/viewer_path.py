@@ -54,8 +54,7 @@ class KeyframeControls:
         """The cameras along the keyframes, None with fewer than two; all have the image size of the first."""
         if len(self._keyframes) < 2:
             return None
-        first = self._keyframes[0]
-        cameras = Cameras.cat([keyframe.resized(first.width, first.height) for keyframe in self._keyframes])
+        cameras = Cameras.of_one_size(self._keyframes)
         return interpolated_path(cameras, FPS * SEGMENT_SECONDS * (len(cameras) - 1) + 1)
 
     def play(self, client: Any) -> None:

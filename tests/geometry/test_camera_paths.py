@@ -144,6 +144,25 @@ def test_an_interpolated_path_passes_every_camera(ring: Cameras) -> None:
     assert (torch.linalg.det(R) > 0).all()
 
 
+def test_photos_of_another_shape_fill_the_frame_of_the_first_and_are_not_stretched() -> None:
+    """Of a portrait, its full width is seen in a landscape frame, and what lies above and below is cut off."""
+
+    def camera(width: int, height: int) -> Cameras:
+        K = torch.tensor([[50.0, 0, 0.5 * width + 3], [0, 52, 0.5 * height - 4], [0, 0, 1]], dtype=torch.float64)
+        return Cameras(torch.eye(4, dtype=torch.float64)[None], K[None], width, height)
+
+    wide, tall, small = camera(60, 40), camera(40, 60), camera(30, 20)
+    batch = Cameras.of_one_size([wide, tall, small])
+    assert (batch.width, batch.height) == (60, 40)
+    assert torch.equal(batch.Ks[0], wide.Ks[0])
+    scaled = [[75.0, 0, 1.5 * 23], [0, 78, 1.5 * 26 - (90 - 40) / 2], [0, 0, 1]]
+    torch.testing.assert_close(batch.Ks[1], torch.tensor(scaled, dtype=torch.float64))
+    torch.testing.assert_close(batch.Ks[2], small.resized(60, 40).Ks[0])
+    turned = Cameras.of_one_size([tall, wide]).Ks[1]
+    torch.testing.assert_close(turned[:2, 2], torch.tensor([1.5 * 33 - (90 - 40) / 2, 1.5 * 16], dtype=torch.float64))
+    assert torch.equal(tall.Ks, camera(40, 60).Ks)
+
+
 def test_an_interpolated_path_of_one_camera_stays_there(ring: Cameras) -> None:
     film = interpolated_path(ring[0], 3)
     torch.testing.assert_close(film.viewmats, ring.viewmats[:1].expand(3, 4, 4), atol=1e-9, rtol=0)

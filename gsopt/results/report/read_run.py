@@ -223,7 +223,7 @@ def _viewer(finished: FinishedRun, scene: Scene) -> str:
 
 def _add_turntable(report: Report, finished: FinishedRun, scene: Scene) -> None:
     size = scene.train[0].camera
-    cameras = Cameras.cat([view.camera.resized(size.width, size.height) for view in scene.train])
+    cameras = Cameras.of_one_size([view.camera for view in scene.train])
     path_cameras = camera_path(finished, cameras, "turntable", TURNTABLE_FRAMES)
     side = min(TURNTABLE_SIDE, 2 * max(size.width, size.height))
     report.turntable = [

@@ -100,7 +100,7 @@ def scene_of_views(run: FinishedRun, scene: Scene) -> WebScene:
     scene = with_refined_poses(scene, run.path)
     inputs = spread([(view.name, view.camera) for view in scene.train])
     held_out = spread([(f"{view.name} (held out)", view.camera) for view in scene.test])
-    cameras = Cameras.cat([camera.resized(*size_of(inputs)) for _, camera in inputs])
+    cameras = Cameras.of_one_size([camera for _, camera in inputs])
     look_at = look_at_point(run.gaussians, cameras)
     focus = find_focus([camera for _, camera in inputs], scene.extent)
     return WebScene(
@@ -141,10 +141,6 @@ def framed(gaussians: Gaussians, camera: Cameras) -> Cameras:
 def spread(views: list[tuple[str, Cameras]]) -> list[tuple[str, Cameras]]:
     """At most MAX_VIEWS of the views, evenly chosen, the first included."""
     return views[:: -(-len(views) // MAX_VIEWS)] if views else []
-
-
-def size_of(views: list[tuple[str, Cameras]]) -> tuple[int, int]:
-    return views[0][1].width, views[0][1].height
 
 
 def scene_of_splats(

@@ -103,13 +103,13 @@ def test_a_turntable_is_no_larger_than_400_pixels_or_twice_the_photos(
     side: int, longest: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr(reading.Cameras, "cat", staticmethod(lambda cameras: cameras))
+    monkeypatch.setattr(reading.Cameras, "of_one_size", staticmethod(lambda cameras: cameras))
     monkeypatch.setattr(
         reading, "camera_path", lambda run, cameras, path, count: (asked.append((path, count)), [1, 2])[1]
     )
     monkeypatch.setattr(reading, "with_longest_side", lambda camera, side: (camera, side))
     monkeypatch.setattr(reading, "as_image", lambda drawn: drawn)
-    camera = SimpleNamespace(width=side, height=side // 2, resized=lambda width, height: (width, height))
+    camera = SimpleNamespace(width=side, height=side // 2)
     scene: Any = SimpleNamespace(train=[SimpleNamespace(camera=camera)])
     found, run = report(), SimpleNamespace(draw=lambda shot: shot)
     reading._add_turntable(found, run, scene)  # type: ignore[arg-type]
