@@ -4,7 +4,9 @@
 
 Each folder holds 9 or more photos of one thing or place. Measured with public ones that are not part of gsopt: `kermit`
 and `et` of Bundler (github.com/snavely/bundler_sfm, examples), `buddha` (github.com/alicevision/dataset_buddha, CC BY
-4.0), `monstree` (github.com/alicevision/dataset_monstree) and `sceaux` (github.com/openMVG/ImageDataset_SceauxCastle).
+4.0), `monstree` (github.com/alicevision/dataset_monstree), `sceaux` (github.com/openMVG/ImageDataset_SceauxCastle),
+`kitchen`, `statue` and `apple` (github.com/facebookresearch/vggsfm, examples, `apple` in its history), and `llff_fern`
+and `llff_flower` (github.com/chenxiex/vggt, examples).
 All photos are posed once and kept in DIR; then so many of them, evenly chosen by name, are given alone to `gsopt sfm`.
 What it finds is aligned with the poses made of all photos by the best similarity. ARM names the rows in
 experiments/results/hand_held_photos.json; rows that are there are not repeated.
