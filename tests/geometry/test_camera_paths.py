@@ -145,7 +145,7 @@ def test_an_interpolated_path_passes_every_camera(ring: Cameras) -> None:
 
 
 def test_photos_of_another_shape_fill_the_frame_of_the_first_and_are_not_stretched() -> None:
-    """Of a portrait, its full width is seen in a landscape frame, and what lies above and below is cut off."""
+    """A landscape frame shows the full width of a portrait and cuts off what lies above and below."""
 
     def camera(width: int, height: int) -> Cameras:
         K = torch.tensor([[50.0, 0, 0.5 * width + 3], [0, 52, 0.5 * height - 4], [0, 0, 1]], dtype=torch.float64)
